@@ -1,0 +1,135 @@
+"""What is said about mistakes in a robot's files and about poses that it cannot take."""
+
+import numpy as np
+import pytest
+
+from kiras_rl.robots.robot import RobotError, load_robot
+from kiras_rl.robots.statics import check_keyframe, examine_keyframe
+
+
+def test_unknown_robot():
+    with pytest.raises(RobotError, match=r"no robot 'solo9' \(did you mean 'solo8'\?\); "
+                       r"available: .*go1, .*solo8"):  # fmt: skip
+        load_robot("solo9")
+
+
+def test_unknown_skill(solo8):
+    with pytest.raises(RobotError, match=r"'wlak' \(did you mean 'walk'\?\); it has: walk, crawl"):
+        solo8.keyframe("wlak")
+
+
+MISTAKES = {
+    "out of reach": (
+        {"tall": {"base_height": 0.4, "pitch": 0, "knees": "back"}},
+        r"keyframe 'tall' of solo8: leg length 0\.384 m needed, 0\.320 m at most: "
+        r"lower base_height by 0\.064 m in .*keyframes\.yaml",
+    ),
+    # the front hips of a nose-up pose are 0.19 sin 30 deg = 0.095 m higher
+    "out of reach when pitched": (
+        {"rear": {"base_height": 0.25, "pitch": -30, "knees": "back"}},
+        r"leg length 0\.329 m needed, 0\.320 m at most: lower base_height by 0\.009 m",
+    ),
+    "in the ground": (
+        {"flat": {"base_height": 0.01, "pitch": 0, "knees": "back"}},
+        r"leg length -0\.006 m needed, 0\.000 m at least: raise base_height by 0\.006 m",
+    ),
+    "beyond a joint limit": (
+        {"twist": {"base_height": 0.2, "pitch": 0, "joint_pos": [3.5, *[0.0] * 7]}},
+        r"keyframe 'twist' of solo8: FL_HFE at 3\.500 rad is 0\.358 rad outside its limits "
+        r"\(-3\.142 to 3\.142\)",
+    ),
+    "unknown key": (
+        {"walk": {"base_heigth": 0.2, "pitch": 0, "knees": "back"}},
+        r"unknown key 'base_heigth' in keyframe 'walk' of solo8 .*\(did you mean 'base_height'\?\)",
+    ),
+    "missing key": ({"walk": {"pitch": 0, "knees": "back"}}, "missing in .*: base_height"),
+    "knees and angles": (
+        {"walk": {"base_height": 0.2, "pitch": 0}},
+        "needs either knees or joint_pos",
+    ),
+    "unknown knees": (
+        {"walk": {"base_height": 0.2, "pitch": 0, "knees": "backward"}},
+        r"knees must be one of back, forward, inward, not 'backward' \(did you mean 'back'\?\)",
+    ),
+    "too few angles": (
+        {"walk": {"base_height": 0.2, "pitch": 0, "joint_pos": [0.1]}},
+        r"joint_pos must be a list of 8 angles in rad \(FL_HFE, .*\), not \[0\.1\]",
+    ),
+    "no number": (
+        {"walk": {"base_height": "high", "pitch": 0, "knees": "back"}},
+        "base_height must be a number, not 'high', in keyframe 'walk' of solo8",
+    ),
+    "no mapping": ({"walk": 0.2}, "keyframe 'walk' of solo8 .* must hold base_height, pitch"),
+}
+
+
+@pytest.mark.parametrize("name", MISTAKES)
+def test_mistakes_in_keyframes(edit, name):
+    entries, message = MISTAKES[name]
+    with pytest.raises(RobotError, match=message):
+        edit("keyframes.yaml", **entries)
+
+
+@pytest.mark.parametrize(
+    ("entries", "message"),
+    [
+        ({"kpp": 5.0}, r"unknown key 'kpp' in .*robot\.yaml \(did you mean 'kp'\?\); allowed: "),
+        ({"kp": None}, r"missing in .*robot\.yaml: kp"),
+        ({"kp": "stiff"}, "kp must be a number, not 'stiff'"),
+        ({"kd": {"*_HFE": 0.1}}, "kd has no value for FL_KFE, FR_KFE, HL_KFE, HR_KFE"),
+        ({"kd": {"*_HAA": 0.1}}, r"kd: '\*_HAA' fits no joint of FL_HFE, "),
+        ({"joints": ["FL_KFE"]}, r"MJCF's order \[FL_HFE, FL_KFE, .*\], not \['FL_KFE'\]"),
+        ({"base_body": "bas"}, r"base_body: 'bas' is not in the MJCF \(did you mean 'base'\?\)"),
+        ({"foot_geoms": ["FL_fot"]}, r"'FL_fot' is not in the MJCF \(did you mean 'FL_foot'\?\)"),
+        ({"foot_geoms": ["FL_shank"]}, "foot_geoms FL_shank must be spheres of one size"),
+        ({"default_joint_pos": "wakl"}, r"no keyframe 'wakl' \(did you mean 'walk'\?\)"),
+    ],
+)
+def test_mistakes_in_robot_yaml(edit, entries, message):
+    with pytest.raises(RobotError, match=message):
+        edit("robot.yaml", **entries)
+
+
+def test_broken_yaml_is_located(edit, tmp_path):
+    path = tmp_path / "solo8" / "keyframes.yaml"
+    path.write_text("walk: {base_height: 0.2\n")
+    with pytest.raises(RobotError, match=r"keyframes\.yaml is not valid YAML: .*line 2"):
+        load_robot("solo8", root=tmp_path)
+
+
+def test_broken_mjcf_is_located(edit, tmp_path):
+    path = tmp_path / "solo8" / "solo8.xml"
+    path.write_text(path.read_text().replace("<freejoint", "<freejiont"))
+    with pytest.raises(RobotError, match=r"solo8\.xml: .*freejiont"):
+        load_robot("solo8", root=tmp_path)
+
+
+def test_keyframe_that_is_too_heavy(edit):
+    robot = edit("robot.yaml", torque_limit=0.5)
+    with pytest.raises(
+        RobotError,
+        match=r"keyframe 'walk' of solo8: H[LR]_KFE needs 0\.7[45] N m to hold it, "
+        r"0\.50 N m at most: change the pose in .*keyframes\.yaml",
+    ):
+        check_keyframe(robot, robot.keyframe("walk"))
+
+
+def test_keyframe_that_floats(edit):
+    pose = {"base_height": 0.35, "pitch": 0, "joint_pos": [0.0] * 8}  # stands at 0.336
+    robot = edit("keyframes.yaml", floating=pose)
+    with pytest.raises(RobotError, match=r"lowest foot is 0\.014 m above .* lower base_height by"):
+        check_keyframe(robot, robot.keyframe("floating"))
+
+
+def test_keyframe_that_tips_over(edit):
+    lean = 1.0  # straight legs swung back by 1 rad: feet 0.27 m behind the hips
+    height = float(0.32 * np.cos(lean) + 0.016)
+    pose = {"base_height": height, "pitch": 0, "joint_pos": [lean, 0.0] * 4}
+    robot = edit("keyframes.yaml", leaning=pose)
+    report = examine_keyframe(robot, robot.keyframe("leaning"))
+    front_feet = 0.190 - 0.32 * np.sin(lean)
+    thighs, shanks = 4 * 0.14853845 * 0.078707, 4 * 0.03763607 * (0.16 + 0.102249)
+    centre = -(thighs + shanks) * np.sin(lean) / 2.17784899
+    assert report.imbalance == pytest.approx(centre - front_feet, abs=1e-3)
+    with pytest.raises(RobotError, match=r"tips over, its centre of mass lies 0\.0\d\d m outside"):
+        check_keyframe(robot, robot.keyframe("leaning"))
