@@ -1,0 +1,58 @@
+"""The hand-written lists of pyproject.toml against the folders: what they miss, the wheel lacks."""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+SETUPTOOLS = PROJECT["tool"]["setuptools"]
+FOLDERS = {name: ROOT / folder for name, folder in SETUPTOOLS["package-dir"].items()}
+
+
+def packages_on_disk() -> list[str]:
+    """Name every folder that holds a Python file, as it is imported."""
+    return sorted(
+        ".".join([name, *folder.relative_to(top).parts])
+        for name, top in FOLDERS.items()
+        for folder in {path.parent for path in top.rglob("*.py")}
+    )
+
+
+def test_every_folder_with_code_is_a_listed_package():
+    assert sorted(SETUPTOOLS["packages"]) == packages_on_disk()
+
+
+def test_every_package_has_an_init_file():
+    missing = [
+        str(folder)
+        for top in FOLDERS.values()
+        for folder in {path.parent for path in top.rglob("*.py")}
+        if not (folder / "__init__.py").is_file()
+    ]
+    assert not missing
+
+
+@pytest.mark.parametrize("package", ["kiras_rl.robots", "kiras_rl.cfg"])
+def test_every_data_file_is_covered_by_a_pattern(package):
+    folder = FOLDERS[package]
+    covered = {path for glob in SETUPTOOLS["package-data"][package] for path in folder.glob(glob)}
+    data = {
+        path
+        for path in folder.rglob("*")
+        if path.is_file() and path.suffix not in {".py", ".pyc"} and path.name[0] != "."
+    }
+    assert sorted(map(str, data - covered)) == []
+
+
+def test_every_command_names_a_module_of_tools():
+    modules = {script.split(":")[0] for script in PROJECT["project"]["scripts"].values()}
+    missing = [
+        module
+        for module in sorted(modules)
+        if not (FOLDERS["kiras_rl.tools"] / f"{module.rpartition('.')[2]}.py").is_file()
+    ]
+    assert not missing
