@@ -1,0 +1,52 @@
+"""The vectorised legged environment."""
+
+from __future__ import annotations
+
+import torch
+
+from kiras_rl.config import Config, ConfigError
+from kiras_rl.envs.quadruped import QuadrupedEnv
+from kiras_rl.robots.robot import load_robot
+
+BACKENDS = ("auto", "native", "warp")
+
+
+def make_env(
+    config: Config, device: torch.device | str = "cpu", num_envs: int | None = None
+) -> QuadrupedEnv:
+    """Build the environment of a configuration.
+
+    Args:
+        config: The run.
+        device: Where the tensors live; `auto` takes the native backend on a CPU, else warp.
+        num_envs: Worlds, if not the configuration's.
+
+    Raises:
+        ConfigError: Unknown backend, or the native backend on a GPU.
+        RobotError: Unknown robot or a keyframe that cannot be.
+    """
+    device = torch.device(device)
+    return QuadrupedEnv(
+        config.env,
+        config.sim,
+        load_robot(config.robot),
+        num_envs or config.num_envs,
+        resolve_backend(config.sim.backend, device),
+        device,
+        config.seed,
+    )
+
+
+def resolve_backend(name: str, device: torch.device) -> str:
+    """Return "native" or "warp".
+
+    Raises:
+        ConfigError: Unknown name, or a native backend asked for on a GPU.
+    """
+    if name not in BACKENDS:
+        raise ConfigError(f"sim.backend={name}: allowed are {', '.join(BACKENDS)}")
+    if name == "auto":
+        return "native" if device.type == "cpu" else "warp"
+    if name == "native" and device.type != "cpu":
+        raise ConfigError("sim.backend=native runs on the CPU: set device=cpu or sim.backend=auto")
+    return name

@@ -1,0 +1,79 @@
+"""What the robots are asked to do: velocity commands and skills."""
+
+from __future__ import annotations
+
+import torch
+
+from kiras_rl.config import CommandConfig, SkillConfig
+from kiras_rl.envs.randomness import UniformBuffer, scale_to
+from kiras_rl.envs.state import Task
+
+COLUMNS = {
+    "command": 3,
+    "command_zero": 1,
+    "command_resample": 1,
+    "skill": 1,
+    "skill_switch": 1,
+    "start": 2,
+}
+"""Random numbers that this module takes each step."""
+
+
+class TaskSampler:
+    """Draws commands, skills and start keyframes; written branch-free over the whole batch."""
+
+    def __init__(
+        self,
+        commands: CommandConfig,
+        skills: SkillConfig,
+        num_skills: int,
+        random: UniformBuffer,
+        device: torch.device,
+    ) -> None:
+        """Begin with uniform skill probabilities."""
+        self._commands = commands
+        self._skills = skills
+        self._num_skills = num_skills
+        self._random = random
+        ranges = [commands.lin_vel_x, commands.lin_vel_y, commands.ang_vel_z]
+        self._low = torch.tensor([r[0] for r in ranges], device=device)
+        self._high = torch.tensor([r[1] for r in ranges], device=device)
+        self.probabilities = torch.full((num_skills,), 1.0 / num_skills, device=device)
+
+    def advance(self, task: Task, reset: torch.Tensor) -> Task:
+        """Return the tasks of the next step.
+
+        Commands and skills change at a reset and, now and then, within an episode.
+
+        Args:
+            task: Tasks of this step.
+            reset: Worlds that begin an episode, (N,) bool.
+        """
+        resample = self._chance("command_resample", self._commands.resample_probability)
+        switch = self._chance("skill_switch", self._skills.switch_probability)
+        command = torch.where((reset | resample)[:, None], self.draw_command(), task.command)
+        skill = torch.where(reset | switch, self.draw_skill(), task.skill)
+        start = torch.where(reset, self.draw_start(skill), task.start)
+        return Task(command=command, skill=skill, start=start)
+
+    def draw_command(self) -> torch.Tensor:
+        """Return new commands, (N, 3)."""
+        command = self._low + (self._high - self._low) * self._random["command"]
+        zero = self._chance("command_zero", self._commands.zero_probability)
+        return command * (~zero)[:, None]
+
+    def draw_skill(self) -> torch.Tensor:
+        """Return new skills by the current probabilities, (N,) int64."""
+        edges = self.probabilities.cumsum(0)
+        drawn = torch.searchsorted(edges, self._random["skill"][:, 0].contiguous(), right=True)
+        return drawn.clamp(max=self._num_skills - 1)
+
+    def draw_start(self, skill: torch.Tensor) -> torch.Tensor:
+        """Return start keyframes: the target's own, or any other with equal chances, (N,)."""
+        uniform = self._random["start"]
+        offset = scale_to(uniform[:, 1], 1.0, float(self._num_skills)).long()
+        other = (skill + offset) % self._num_skills
+        return torch.where(uniform[:, 0] < self._skills.start_at_target, skill, other)
+
+    def _chance(self, column: str, probability: float) -> torch.Tensor:
+        return self._random[column][:, 0] < probability

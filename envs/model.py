@@ -1,0 +1,102 @@
+"""The MuJoCo model of the environment: a robot's scene plus the sensors that the MDP reads."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import mujoco
+
+from kiras_rl.robots.robot import Robot
+
+_OBJ = mujoco.mjtObj
+_SENSOR = mujoco.mjtSensor
+_NET_FORCE = 3  # contact sensor: sum of all contact forces, in the world frame
+
+
+@dataclass(frozen=True)
+class SensorLayout:
+    """Where each quantity lies in `sensordata`; a slice spans all feet, joints or geoms.
+
+    Attributes:
+        foot_pos_w: Centres of the foot spheres, F * 3, m.
+        foot_vel_w: Velocities of those centres, F * 3, m/s.
+        foot_force_w: Net contact force of each foot on the ground, F * 3, N.
+        base_force_w: The same for the geoms of the base, B * 3, N.
+        limb_force_w: The same for the penalised geoms, L * 3, N.
+        joint_torque: Actuator torques, J, N m.
+    """
+
+    foot_pos_w: slice
+    foot_vel_w: slice
+    foot_force_w: slice
+    base_force_w: slice
+    limb_force_w: slice
+    joint_torque: slice
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A compiled model with the addresses that the environment needs."""
+
+    model: mujoco.MjModel
+    sensors: SensorLayout
+    base_body: int
+    robot_geoms: list[int]
+
+
+def build_scene(robot: Robot, timestep: float, solver_iterations: int, max_delay: int = 0) -> Scene:
+    """Compile the scene of a robot on flat ground.
+
+    Args:
+        robot: The robot.
+        timestep: Physics step, s.
+        solver_iterations: Newton and line-search iterations at most.
+        max_delay: Longest actuation delay in physics steps; 0 allocates no delay buffers.
+    """
+    spec = robot.spec(visuals=False)
+    spec.option.timestep = timestep
+    spec.option.iterations = solver_iterations
+    spec.option.ls_iterations = solver_iterations
+    if max_delay:
+        for actuator in spec.actuators:
+            actuator.nsample = max_delay
+    names = _add_sensors(spec, robot)
+    model = spec.compile()
+    return Scene(
+        model=model,
+        sensors=SensorLayout(**{key: _span(model, value) for key, value in names.items()}),
+        base_body=model.body(robot.base_body).id,
+        robot_geoms=[i for i in range(model.ngeom) if model.geom_priority[i] > 0],
+    )
+
+
+def _add_sensors(spec: mujoco.MjSpec, robot: Robot) -> dict[str, list[str]]:
+    """Add all sensors, grouped so that each quantity is contiguous; return their names."""
+
+    def add(prefix: str, kind: mujoco.mjtSensor, objtype: mujoco.mjtObj, objects: tuple) -> list:
+        for name in objects:
+            sensor = spec.add_sensor(name=f"{prefix}/{name}", type=kind)
+            sensor.objtype, sensor.objname = objtype, name
+            if kind == _SENSOR.mjSENS_CONTACT:
+                force = 1 << int(mujoco.mjtConDataField.mjCONDATA_FORCE)
+                sensor.intprm[:3] = [force, _NET_FORCE, 1]
+        return [f"{prefix}/{name}" for name in objects]
+
+    contact, geom = _SENSOR.mjSENS_CONTACT, _OBJ.mjOBJ_GEOM
+    return {
+        "foot_pos_w": add("pos", _SENSOR.mjSENS_FRAMEPOS, geom, robot.foot_geoms),
+        "foot_vel_w": add("vel", _SENSOR.mjSENS_FRAMELINVEL, geom, robot.foot_geoms),
+        "foot_force_w": add("foot", contact, geom, robot.foot_geoms),
+        "base_force_w": add("base", contact, geom, robot.base_geoms),
+        "limb_force_w": add("limb", contact, geom, robot.penalised_geoms),
+        "joint_torque": add(
+            "torque", _SENSOR.mjSENS_ACTUATORFRC, _OBJ.mjOBJ_ACTUATOR, robot.joint_names
+        ),
+    }
+
+
+def _span(model: mujoco.MjModel, names: list[str]) -> slice:
+    sensors = [model.sensor(name) for name in names]
+    start = int(sensors[0].adr[0])
+    stop = start + sum(int(s.dim[0]) for s in sensors)
+    return slice(start, stop)

@@ -1,0 +1,469 @@
+"""The environment: one robot, S skills, N worlds, with the rsl-rl VecEnv interface."""
+
+from __future__ import annotations
+
+import math
+import time
+
+import mujoco
+import torch
+from tensordict import TensorDict
+from torch.nn.functional import one_hot
+
+from kiras_rl import interfaces as names
+from kiras_rl.config import EnvConfig, SimConfig
+from kiras_rl.envs import commands, randomization, rotations, terminations
+from kiras_rl.envs.commands import TaskSampler
+from kiras_rl.envs.kinematics import FootKinematics
+from kiras_rl.envs.model import Scene, build_scene
+from kiras_rl.envs.observations import ObservationGroup, View
+from kiras_rl.envs.randomization import Randomizer
+from kiras_rl.envs.randomness import UniformBuffer, scale_to
+from kiras_rl.envs.rewards import RewardSum
+from kiras_rl.envs.simulation.base import Simulation
+from kiras_rl.envs.state import Keyframes, RobotState, Step, Task
+from kiras_rl.interfaces import Measurements, SkillEnv
+from kiras_rl.robots.robot import Robot
+
+SPAWN_CLEARANCE = 0.002  # m between the lowest foot and the ground at a reset
+KEYFRAME_COMMANDS = (0.0, 0.4, 0.8)  # of the largest v_x, for the value of a skill
+
+
+class QuadrupedEnv(SkillEnv):
+    """See SkillEnv for the interface and `step` for the order of one control step."""
+
+    def __init__(
+        self,
+        cfg: EnvConfig,
+        sim_cfg: SimConfig,
+        robot: Robot,
+        num_envs: int,
+        backend: str,
+        device: torch.device,
+        seed: int,
+    ) -> None:
+        """Build the scene, the worlds and the terms, and reset every world."""
+        self.cfg, self.robot_cfg = cfg, robot
+        self.num_envs, self.num_actions = num_envs, len(robot.joint_names)
+        self.device = device
+        self.skills = robot.skills
+        self.step_dt = sim_cfg.timestep * sim_cfg.substeps
+        self.max_episode_length = round(cfg.terminations.episode_length / self.step_dt)
+        self._scene = _build_scene(robot, sim_cfg, cfg)
+        self.sim = _make_simulation(self._scene.model, sim_cfg, num_envs, backend, device)
+        self.keyframes = Keyframes.of(robot, device)
+        self.keyframe_height, self.keyframe_pitch = self.keyframes.height, self.keyframes.pitch
+        self._allocate(robot)
+        self._build_terms(seed)
+        self._begin()
+
+    # --- construction -------------------------------------------------------------------------
+
+    def _allocate(self, robot: Robot) -> None:
+        n, device = self.num_envs, self.device
+
+        def tensor(values: object) -> torch.Tensor:
+            return torch.tensor(values, dtype=torch.float32, device=device)
+
+        self._default_joint_pos = tensor(robot.default_joint_pos)
+        self._action_scale = tensor(robot.action_scale)
+        self._all = torch.ones(n, dtype=torch.bool, device=device)
+        index = torch.zeros(n, dtype=torch.int64, device=device)
+        self.task = Task(torch.zeros(n, 3, device=device), index, index.clone())
+        self._held = False  # tasks set from outside stay until set again
+        self._length = index.clone()
+        self._action = torch.zeros(n, self.num_actions, device=device)
+        self._last_joint_vel = torch.zeros(n, self.num_actions, device=device)
+        self._last_joint_torque = torch.zeros(n, self.num_actions, device=device)
+        self._measurements: Measurements | None = None
+        self.robot = RobotState(self.sim, self._scene.sensors, robot)
+        self._kinematics = FootKinematics(self._scene.model, robot, device)
+
+    def _build_terms(self, seed: int) -> None:
+        cfg, view = self.cfg, self._view()
+        groups = cfg.observations
+        self.proprio = ObservationGroup("proprio", groups.proprio, view)
+        self.critic = ObservationGroup("critic", groups.critic, view)
+        self.imitation = ObservationGroup("imitation", groups.imitation, view)
+        self.keyframe_features = self._features_of_keyframes()
+        self.feature_noise = self.imitation.noise
+        self._rewards = RewardSum(cfg.rewards, self.step_dt, self.device)
+        generator = torch.Generator(device=self.device)
+        generator.manual_seed(seed)
+        columns = {"joint": self.num_actions, "velocity": 2, "noise": self.proprio.size}
+        columns |= commands.COLUMNS | randomization.COLUMNS
+        self._random = UniformBuffer(self.num_envs, columns, generator)
+        self._tasks = TaskSampler(
+            cfg.commands, cfg.skills, len(self.skills), self._random, self.device
+        )
+        self._randomizer = Randomizer(cfg.randomization, self._scene, self.sim, self._random)
+
+    def _begin(self) -> None:
+        size = self.proprio.size
+        self._proprio = torch.zeros(self.num_envs, size, device=self.device)
+        self._history = self._proprio.repeat(1, self.cfg.observations.history_length)
+        self.reset()
+        if self.cfg.terminations.random_first_length:
+            # Otherwise all worlds time out together, and the data of a rollout is all alike.
+            uniform = torch.rand(
+                self.num_envs, generator=self._random.generator, device=self.device
+            )
+            self._length[:] = (uniform * self.max_episode_length).long()
+
+    # --- one control step ---------------------------------------------------------------------
+
+    def step(self, actions: torch.Tensor) -> tuple[TensorDict, torch.Tensor, torch.Tensor, dict]:
+        """Advance every world by one control step; reset those that end.
+
+        The order: act, simulate, judge (terminations, rewards, imitation features: all of the
+        motion that just happened), then choose what comes next (tasks, resets, pushes), and
+        observe. What is judged is never touched by a reset, and what is observed is never older
+        than the reset.
+
+        Args:
+            actions: Unscaled joint targets around q0, (N, J).
+
+        Returns:
+            observations: Groups of kiras_rl.interfaces, new tensors.
+            rewards: Task reward, unclipped, (N,).
+            dones: Episodes that ended, (N,) bool.
+            extras: The EXTRA_* tensors of kiras_rl.interfaces, NEXT_PROPRIO and `log`.
+        """
+        last_action = self._action
+        self._action = actions.clamp(-self.cfg.action_clip, self.cfg.action_clip)
+        begin = time.perf_counter()
+        self.sim.step(self._joint_targets(self._action))
+        self._physics_time = time.perf_counter() - begin
+        self._length += 1
+        self.robot.read_step()
+        self._random.refill()
+
+        invalid = self.sim.diverged | self.sim.overflowed
+        fallen = self._fallen() | invalid
+        time_outs = (self._length >= self.max_episode_length) & ~fallen
+        terms = self._judge(last_action, fallen, invalid)
+        view = self._view()
+        extras = {
+            names.EXTRA_TIME_OUTS: time_outs,
+            names.EXTRA_IMITATION: self._unless(invalid, self.imitation(view), self._features),
+            names.EXTRA_VALID: ~invalid,
+            names.NEXT_PROPRIO: self._unless(invalid, self.proprio(view), self._clean),
+            "log": self._log(terms, fallen, time_outs),
+        }
+        self._measurements = self._measure(fallen)
+
+        done = fallen | time_outs
+        self._begin_next(done)
+        return self._observe(done), terms.sum(dim=1), done, extras
+
+    def _joint_targets(self, action: torch.Tensor) -> torch.Tensor:
+        return self._default_joint_pos + self._action_scale * action
+
+    def _fallen(self) -> torch.Tensor:
+        limits = self.cfg.terminations
+        cos_limit = math.cos(math.radians(limits.max_tilt))
+        return terminations.base_contact(
+            self.robot, limits.base_contact_force
+        ) | terminations.tilted(self.robot, self.task, self.keyframes, cos_limit)
+
+    def _judge(
+        self, last_action: torch.Tensor, fallen: torch.Tensor, invalid: torch.Tensor
+    ) -> torch.Tensor:
+        """Return the weighted reward terms, (N, terms).
+
+        A world whose physics broke has no meaningful terms; it earns nothing but the termination.
+        """
+        step = Step(
+            robot=self.robot,
+            task=self.task,
+            keyframes=self.keyframes,
+            action=self._action,
+            last_action=last_action,
+            last_joint_vel=self._last_joint_vel,
+            last_joint_torque=self._last_joint_torque,
+            fresh=self._length == 1,
+            fallen=fallen,
+            dt=self.step_dt,
+        )
+        terms = self._rewards(step)
+        return torch.where(invalid[:, None] & ~self._rewards.is_termination, 0.0, terms)
+
+    def _begin_next(self, done: torch.Tensor) -> None:
+        """Choose the next tasks, reset the worlds that ended and push some of the others."""
+        if not self._held:
+            self.task = self._tasks.advance(self.task, done)
+        self._last_joint_torque = self.robot.joint_torque.clone()
+        self._reset_worlds(done, self.task.start)
+        push, velocity = self._randomizer.pushes(self.step_dt)
+        qvel = self.sim.qvel.clone()
+        qvel[:, :2] += velocity
+        self.sim.write_velocity(push & ~done, qvel)
+        self.sim.forward()
+        self.robot.read_kinematics()
+        self._last_joint_vel = self.robot.joint_vel.clone()
+
+    def _reset_worlds(self, mask: torch.Tensor, start: torch.Tensor) -> None:
+        """Put the masked worlds into the keyframes `start`, (N,), with new physics."""
+        self._randomizer.reset(mask)
+        qpos, qvel = self._initial_state(start)
+        joint_pos = qpos[:, 7:]
+        self.sim.write_state(mask, qpos, qvel, joint_pos)
+        # The targets that hold the start pose: what was "commanded" before the episode.
+        holding = (joint_pos - self._default_joint_pos) / self._action_scale
+        self._action = torch.where(mask[:, None], holding, self._action)
+        self._last_joint_torque = torch.where(mask[:, None], 0.0, self._last_joint_torque)
+        self._length = torch.where(mask, 0, self._length)
+
+    def _initial_state(self, start: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return qpos (N, 7 + J) and qvel (N, 6 + J) near the keyframes `start`."""
+        frames, skills = self.keyframes, self.cfg.skills
+        n = self.num_envs
+        noise = skills.joint_noise
+        joint_pos = frames.joint_pos[start] + scale_to(self._random["joint"], -noise, noise)
+        qpos = torch.zeros(n, 7 + self.num_actions, device=self.device)
+        pitch = frames.pitch[start]
+        qpos[:, 3:7] = rotations.quat_from_pitch_yaw(pitch, torch.zeros_like(pitch))
+        qpos[:, 7:] = joint_pos
+        qpos[:, 2] = SPAWN_CLEARANCE - self._kinematics.lowest_foot(pitch, joint_pos)
+        qvel = torch.zeros(n, 6 + self.num_actions, device=self.device)
+        speed = skills.velocity_noise
+        qvel[:, :2] = scale_to(self._random["velocity"], -speed, speed)
+        return qpos, qvel
+
+    # --- observations -------------------------------------------------------------------------
+
+    def _view(self) -> View:
+        return View(self.robot, self.task, self.keyframes, self._default_joint_pos, self._action)
+
+    def _observe(self, begun: torch.Tensor) -> TensorDict:
+        """Return the observation; worlds that have just `begun` (N,) get a fresh history."""
+        view, frames = self._view(), self.cfg.observations.history_length
+        self._clean, self._features = self.proprio(view), self.imitation(view)
+        proprio = self._with_noise(self._clean)
+        size = self.proprio.size
+        shifted = torch.cat([self._history[:, size:], self._proprio], dim=1)
+        self._history = torch.where(begun[:, None], proprio.repeat(1, frames), shifted)
+        self._proprio = proprio
+        groups = {
+            names.PROPRIO: proprio,
+            names.HISTORY: self._history,
+            names.CRITIC: torch.cat([self._clean, self.critic(view)], dim=1),
+            names.IMITATION: self._features,
+            names.VELOCITY: self.robot.base_lin_vel_b,
+            names.SKILL: one_hot(self.task.skill, len(self.skills)).float(),
+            names.COMMAND: self.task.command,
+        }
+        self._observation = TensorDict(groups, batch_size=[self.num_envs], device=self.device)
+        return self._observation
+
+    def _with_noise(self, clean: torch.Tensor) -> torch.Tensor:
+        if not self.cfg.observations.noise:
+            return clean
+        return clean + self.proprio.noise * scale_to(self._random["noise"], -1.0, 1.0)
+
+    @staticmethod
+    def _unless(mask: torch.Tensor, new: torch.Tensor, old: torch.Tensor) -> torch.Tensor:
+        """Return `new` (N, k), with `old` in the masked worlds."""
+        return torch.where(mask[:, None], old, new)
+
+    def _measure(self, fallen: torch.Tensor) -> Measurements:
+        robot = self.robot
+        return Measurements(
+            base_height=robot.base_height.clone(),
+            pitch=robot.roll_pitch[:, 1],
+            roll=robot.roll_pitch[:, 0],
+            lin_vel_h=robot.base_lin_vel_h,
+            yaw_rate=robot.yaw_rate,
+            foot_contact=robot.foot_contact,
+            fallen=fallen,
+        )
+
+    def _log(
+        self, terms: torch.Tensor, fallen: torch.Tensor, time_outs: torch.Tensor
+    ) -> dict[str, torch.Tensor]:
+        means = terms.mean(dim=0).unbind()
+        log = {
+            f"Reward/{name}": mean for name, mean in zip(self._rewards.names, means, strict=True)
+        }
+        log["Episode/falls"] = fallen.float().sum()
+        log["Episode/time_outs"] = time_outs.float().sum()
+        log["Sim/diverged"] = self.sim.diverged.float().sum()
+        log["Sim/overflowed"] = self.sim.overflowed.float().sum()
+        log["Perf/physics_time"] = torch.tensor(self._physics_time)
+        return log
+
+    # --- the rest of SkillEnv -----------------------------------------------------------------
+
+    def get_observations(self) -> TensorDict:
+        """Return the observation of the last step or reset."""
+        return self._observation
+
+    @property
+    def episode_length_buf(self) -> torch.Tensor:
+        """Steps since the last reset, (N,) int64; rsl-rl assigns to it."""
+        return self._length
+
+    @episode_length_buf.setter
+    def episode_length_buf(self, value: torch.Tensor) -> None:
+        self._length = value.to(self.device, torch.int64).clone()
+
+    def seed(self, seed: int) -> None:
+        """Restart the random numbers."""
+        self._random.generator.manual_seed(seed)
+
+    def reset(
+        self, skill: torch.Tensor | None = None, command: torch.Tensor | None = None
+    ) -> TensorDict:
+        """Reset every world; a given skill starts at its own keyframe and stays."""
+        self._random.refill()
+        task = self._tasks.advance(self.task, self._all)
+        self._held = self._held or skill is not None
+        start = task.start if skill is None else skill
+        skill = task.skill if skill is None else skill
+        command = task.command if command is None else command
+        self.task = Task(command=command.clone(), skill=skill.clone(), start=start.clone())
+        self._reset_worlds(self._all, self.task.start)
+        self.sim.forward()
+        self.robot.read_kinematics()
+        self._last_joint_vel = self.robot.joint_vel.clone()
+        return self._observe(self._all)
+
+    def set_task(self, skill: torch.Tensor, command: torch.Tensor) -> TensorDict:
+        """Give every world a new skill and command, which stay until the next call."""
+        self._held = True
+        self.task = Task(command=command.clone(), skill=skill.clone(), start=self.task.start)
+        view = self._view()
+        clean = self.proprio(view)
+        self._proprio = self._proprio + clean - self._clean  # the same noise, the new task
+        self._clean, self._features = clean, self.imitation(view)
+        self._observation = self._observation.clone()
+        self._observation[names.PROPRIO] = self._proprio
+        self._observation[names.CRITIC] = torch.cat([clean, self.critic(view)], dim=1)
+        self._observation[names.IMITATION] = self._features
+        self._observation[names.SKILL] = one_hot(skill, len(self.skills)).float()
+        self._observation[names.COMMAND] = self.task.command
+        return self._observation
+
+    def set_skill_probabilities(self, probabilities: torch.Tensor) -> None:
+        """Set the probabilities with which new skills are drawn, (S,)."""
+        self._tasks.probabilities = probabilities.to(self.device)
+
+    def measure(self) -> Measurements:
+        """Return the measurements of the last step, before its resets."""
+        return self._measurements
+
+    def _features_of_keyframes(self) -> torch.Tensor:
+        """Return Phi in each keyframe at rest, (S, D)."""
+        skills = torch.arange(len(self.skills), device=self.device)
+        return self.imitation(self._at_rest(skills, torch.zeros(len(skills), 3)))
+
+    def keyframe_observations(self) -> torch.Tensor:
+        """Return critic observations at rest in each keyframe for G commands, (S, G, C)."""
+        count, grid = len(self.skills), len(KEYFRAME_COMMANDS)
+        skills = torch.arange(count, device=self.device).repeat_interleave(grid)
+        command = torch.zeros(count * grid, 3, device=self.device)
+        largest = self.cfg.commands.lin_vel_x[1]
+        command[:, 0] = largest * torch.tensor(KEYFRAME_COMMANDS, device=self.device).repeat(count)
+        view = self._at_rest(skills, command)
+        return torch.cat([self.proprio(view), self.critic(view)], dim=1).unflatten(0, (count, grid))
+
+    def _at_rest(self, skill: torch.Tensor, command: torch.Tensor) -> View:
+        robot = RobotState.at_rest(self.keyframes, skill, len(self.robot_cfg.foot_geoms))
+        action = (robot.joint_pos - self._default_joint_pos) / self._action_scale
+        task = Task(command.to(self.device), skill, skill)
+        return View(robot, task, self.keyframes, self._default_joint_pos, action)
+
+    def describe(self) -> dict:
+        """Return the deployment contract of a policy trained here."""
+        robot, proprio, ranges = self.robot_cfg, self.proprio, self.cfg.commands
+        terms = zip(proprio.names, proprio.sizes, proprio.scales, strict=True)
+        return {
+            "robot": robot.name,
+            "joint_names": list(robot.joint_names),
+            **{
+                name: getattr(robot, name).tolist()
+                for name in ("default_joint_pos", "kp", "kd", "torque_limit", "action_scale")
+            },
+            "action_clip": self.cfg.action_clip,
+            "observation": [{"name": n, "size": k, "scale": x} for n, k, x in terms],
+            "history_length": self.cfg.observations.history_length,
+            "skills": list(self.skills),
+            "keyframes": {
+                k.name: {
+                    "base_height": k.base_height,
+                    "pitch": k.pitch,
+                    "joint_pos": k.joint_pos.tolist(),
+                }
+                for k in robot.keyframes
+            },
+            "control_rate": 1.0 / self.step_dt,
+            "command_range": {
+                name: list(getattr(ranges, name))
+                for name in ("lin_vel_x", "lin_vel_y", "ang_vel_z")
+            },
+        }
+
+    def state_dict(self) -> dict:
+        """Return all that the next steps depend on, for an exact resume."""
+        return {
+            "sim": self.sim.state_dict(),
+            "task": vars(self.task).copy(),
+            "held": self._held,
+            "probabilities": self._tasks.probabilities,
+            "generator": self._random.generator.get_state(),
+            "observation": self._observation.to_dict(),
+            "buffers": {name: getattr(self, name) for name in _BUFFERS},
+        }
+
+    def load_state_dict(self, state: dict) -> None:
+        """Go on from a saved state of the same number of worlds."""
+        self.sim.load_state_dict(state["sim"])
+        self.task = Task(**{k: v.to(self.device) for k, v in state["task"].items()})
+        self._held = state["held"]
+        self.set_skill_probabilities(state["probabilities"])
+        self._random.generator.set_state(state["generator"].cpu())
+        for name in _BUFFERS:
+            setattr(self, name, state["buffers"][name].to(self.device))
+        self._observation = TensorDict(
+            state["observation"], batch_size=[self.num_envs], device=self.device
+        )
+        self.robot.read_kinematics()
+
+
+_BUFFERS = (
+    "_length",
+    "_action",
+    "_last_joint_vel",
+    "_last_joint_torque",
+    "_history",
+    "_proprio",
+    "_clean",
+    "_features",
+)
+
+
+def _build_scene(robot: Robot, sim_cfg: SimConfig, cfg: EnvConfig) -> Scene:
+    delay = cfg.randomization.action_delay
+    return build_scene(
+        robot, sim_cfg.timestep, sim_cfg.solver_iterations, max_delay=delay[1] if delay else 0
+    )
+
+
+def _make_simulation(
+    model: mujoco.MjModel, sim_cfg: SimConfig, num_worlds: int, backend: str, device: torch.device
+) -> Simulation:
+    if backend == "native":
+        from kiras_rl.envs.simulation.native import NativeSimulation
+
+        return NativeSimulation(model, num_worlds, sim_cfg.substeps, sim_cfg.threads)
+    # Imported late: it takes seconds, and a CPU user never needs it.
+    from kiras_rl.envs.simulation.warp import WarpSimulation
+
+    return WarpSimulation(
+        model,
+        num_worlds,
+        sim_cfg.substeps,
+        device,
+        max_contacts=sim_cfg.max_contacts,
+        max_constraints=sim_cfg.max_constraints,
+    )

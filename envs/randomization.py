@@ -1,0 +1,101 @@
+"""Domain randomization: the paper's table, drawn anew in every world at every reset."""
+
+from __future__ import annotations
+
+import torch
+
+from kiras_rl.config import RandomizationConfig
+from kiras_rl.envs.model import Scene
+from kiras_rl.envs.randomness import UniformBuffer, scale_to
+from kiras_rl.envs.simulation.base import Simulation
+
+COLUMNS = {
+    "friction": 1,
+    "payload": 1,
+    "com_shift": 3,
+    "kp_factor": 1,
+    "kd_factor": 1,
+    "action_delay": 1,
+    "push": 2,
+    "push_chance": 1,
+}
+"""Random numbers that this module takes each step."""
+
+
+class Randomizer:
+    """Writes model fields of the worlds that reset, and pushes bases now and then."""
+
+    def __init__(
+        self, config: RandomizationConfig, scene: Scene, sim: Simulation, random: UniformBuffer
+    ) -> None:
+        """Remember the nominal values."""
+        self._config, self._scene, self._sim, self._random = config, scene, sim, random
+        model = scene.model
+
+        def nominal(field: str) -> torch.Tensor:
+            values = torch.tensor(getattr(model, field), dtype=torch.float32, device=sim.device)
+            return values.expand(sim.num_worlds, *values.shape)
+
+        self._friction = nominal("geom_friction")
+        self._mass, self._com = nominal("body_mass"), nominal("body_ipos")
+        self._gain, self._bias = nominal("actuator_gainprm"), nominal("actuator_biasprm")
+        self._delay = nominal("actuator_delay")
+
+    def reset(self, mask: torch.Tensor) -> None:
+        """Draw the physics of the masked worlds, (N,) bool."""
+        config = self._config
+        if config.friction:
+            self._write_friction(mask, self._draw("friction", config.friction))
+        if config.payload or config.com_shift:
+            self._write_base(mask)
+        if config.kp_factor or config.kd_factor:
+            self._write_gains(mask)
+        if config.action_delay:
+            self._write_delay(mask, config.action_delay)
+
+    def pushes(self, step_dt: float) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return which worlds are pushed now, (N,) bool, and the added velocity, (N, 2), m/s."""
+        limits = self._config.push_velocity or (0.0, 0.0)
+        rate = step_dt / self._config.push_interval if self._config.push_velocity else 0.0
+        mask = self._random["push_chance"][:, 0] < rate
+        return mask, scale_to(self._random["push"], *limits)
+
+    def _draw(self, column: str, limits: tuple[float, float] | None) -> torch.Tensor | None:
+        return None if limits is None else scale_to(self._random[column], *limits)
+
+    def _write_friction(self, mask: torch.Tensor, friction: torch.Tensor) -> None:
+        values = self._friction.clone()
+        values[:, self._scene.robot_geoms, 0] = friction  # (N, 1) on every geom of the robot
+        self._sim.write_field("geom_friction", mask, values)
+
+    def _write_base(self, mask: torch.Tensor) -> None:
+        mass, com = self._mass.clone(), self._com.clone()
+        base, config = self._scene.base_body, self._config
+        if config.payload:
+            mass[:, base] += scale_to(self._random["payload"][:, 0], *config.payload)
+        if config.com_shift:
+            com[:, base] += scale_to(self._random["com_shift"], *config.com_shift)
+        self._sim.write_field("body_mass", mask, mass)
+        self._sim.write_field("body_ipos", mask, com)
+        self._sim.set_const(mask)
+
+    def _write_gains(self, mask: torch.Tensor) -> None:
+        """Scale a position actuator: gain kp, bias (0, -kp, -kd)."""
+        gain, bias = self._gain.clone(), self._bias.clone()
+        kp = self._draw("kp_factor", self._config.kp_factor)
+        kd = self._draw("kd_factor", self._config.kd_factor)
+        if kp is not None:
+            gain[..., 0] *= kp
+            bias[..., 1] *= kp
+        if kd is not None:
+            bias[..., 2] *= kd
+        self._sim.write_field("actuator_gainprm", mask, gain)
+        self._sim.write_field("actuator_biasprm", mask, bias)
+
+    def _write_delay(self, mask: torch.Tensor, limits: tuple[int, int]) -> None:
+        """Delay the targets by whole physics steps, one delay for all joints of a world."""
+        steps = scale_to(self._random["action_delay"], limits[0], limits[1] + 1).floor()
+        # Half a step less than k steps still reads the target of k steps ago, and stays right when
+        # float32 time has lost its last digits after 16 s.
+        seconds = (steps - 0.5).clamp(min=0.0) * self._scene.model.opt.timestep
+        self._sim.write_field("actuator_delay", mask, seconds.expand_as(self._delay))

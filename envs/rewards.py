@@ -1,0 +1,174 @@
+"""Reward terms: one pure function each, (Step, parameters of the YAML) -> (N,).
+
+A term's value is positive; its weight in the YAML gives the sign. The paper's table is
+cfg/paper.yaml.
+"""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable
+from functools import partial
+
+import torch
+
+from kiras_rl.config import ConfigError, RewardConfig
+from kiras_rl.envs.lookup import find_function
+from kiras_rl.envs.state import Step
+
+STANDING = 0.1  # m/s or rad/s; a smaller command asks to stand
+
+
+def tracking_lin_vel(step: Step, sigma: float, lateral: float = 0.0) -> torch.Tensor:
+    """Return exp(-error^2 / sigma) of the horizontal velocity; `lateral` weighs the y error."""
+    error = (step.task.command[:, :2] - step.robot.base_lin_vel_h[:, :2]).square()
+    return torch.exp(-(error[:, 0] + lateral * error[:, 1]) / sigma)
+
+
+def tracking_ang_vel(step: Step, sigma: float) -> torch.Tensor:
+    """Return exp(-error^2 / sigma) of the yaw rate."""
+    return torch.exp(-(step.task.command[:, 2] - step.robot.yaw_rate).square() / sigma)
+
+
+def action_rate(step: Step) -> torch.Tensor:
+    """Return the norm of the change of action."""
+    return torch.linalg.vector_norm(step.action - step.last_action, dim=-1)
+
+
+def action_rate_squared(step: Step) -> torch.Tensor:
+    """Return the squared norm of the change of action, as legged_gym defines it."""
+    return (step.action - step.last_action).square().sum(-1)
+
+
+def torques(step: Step) -> torch.Tensor:
+    """Return the sum of squared joint torques, (N m)^2."""
+    return step.robot.joint_torque.square().sum(-1)
+
+
+def delta_torques(step: Step) -> torch.Tensor:
+    """Return the sum of squared changes of joint torque, (N m)^2; zero after a reset."""
+    change = (step.robot.joint_torque - step.last_joint_torque).square().sum(-1)
+    return torch.where(step.fresh, 0.0, change)
+
+
+def joint_acceleration(step: Step) -> torch.Tensor:
+    """Return the sum of squared mean joint accelerations, (rad/s^2)^2."""
+    return ((step.robot.joint_vel - step.last_joint_vel) / step.dt).square().sum(-1)
+
+
+def ang_vel_xy(step: Step) -> torch.Tensor:
+    """Return the squared roll and pitch rates, (rad/s)^2."""
+    return step.robot.base_ang_vel_b[:, :2].square().sum(-1)
+
+
+def ang_vel_x_abs(step: Step) -> torch.Tensor:
+    """Return the absolute roll rate, rad/s."""
+    return step.robot.base_ang_vel_b[:, 0].abs()
+
+
+def ang_vel_z_abs(step: Step) -> torch.Tensor:
+    """Return the absolute yaw rate, rad/s."""
+    return step.robot.base_ang_vel_b[:, 2].abs()
+
+
+def lin_vel_y(step: Step) -> torch.Tensor:
+    """Return the squared lateral velocity, (m/s)^2."""
+    return step.robot.base_lin_vel_h[:, 1].square()
+
+
+def lin_vel_y_abs(step: Step) -> torch.Tensor:
+    """Return the absolute lateral velocity, m/s."""
+    return step.robot.base_lin_vel_h[:, 1].abs()
+
+
+def foot_slip(step: Step) -> torch.Tensor:
+    """Return the sum of squared horizontal speeds of the standing feet, (m/s)^2."""
+    speed = step.robot.foot_vel_w[..., :2].square().sum(-1)
+    return (speed * step.robot.foot_contact).sum(-1)
+
+
+def feet_drag(step: Step) -> torch.Tensor:
+    """Return minus the summed |v_x| + |v_y| of the standing feet, m/s (weight +0.5 [paper])."""
+    speed = step.robot.foot_vel_w[..., :2].abs().sum(-1)
+    return -(speed * step.robot.foot_contact).sum(-1)
+
+
+def feet_contact_forces(step: Step, threshold: float, largest: float) -> torch.Tensor:
+    """Return the sum of foot forces above `threshold`, each excess at most `largest`, N."""
+    return (step.robot.foot_force - threshold).clamp(0.0, largest).sum(-1)
+
+
+def collision(step: Step, threshold: float) -> torch.Tensor:
+    """Return the number of penalised geoms that press with more than `threshold` N."""
+    return (step.robot.limb_force > threshold).float().sum(-1)
+
+
+def stand_still(step: Step) -> torch.Tensor:
+    """Return the sum of absolute joint velocities when asked to stand, rad/s."""
+    return torch.where(_standing(step), step.robot.joint_vel.abs().sum(-1), 0.0)
+
+
+def stand_still_pose(step: Step) -> torch.Tensor:
+    """Return the sum of |q - keyframe| when asked to stand, rad."""
+    error = (step.robot.joint_pos - step.keyframes.joint_pos[step.task.skill]).abs().sum(-1)
+    return torch.where(_standing(step), error, 0.0)
+
+
+def skill_height(step: Step, sigma: float) -> torch.Tensor:
+    """Return exp(-(error / sigma)^2) of the base height (the manual reward of w/o SIL)."""
+    error = step.robot.base_height - step.keyframes.height[step.task.skill]
+    return torch.exp(-(error / sigma).square())
+
+
+def skill_orientation(step: Step, sigma: float) -> torch.Tensor:
+    """Return exp(-(error / sigma)^2) of projected gravity (the manual reward of w/o SIL)."""
+    error = step.robot.gravity_b - step.keyframes.gravity_b[step.task.skill]
+    return torch.exp(-error.square().sum(-1) / sigma**2)
+
+
+def termination(step: Step) -> torch.Tensor:
+    """Return 1 where an episode ends by failure."""
+    return step.fallen.float()
+
+
+def _standing(step: Step) -> torch.Tensor:
+    return torch.linalg.vector_norm(step.task.command, dim=-1) < STANDING
+
+
+class RewardSum:
+    """The weighted sum of the configured terms."""
+
+    def __init__(self, config: RewardConfig, step_dt: float, device: torch.device) -> None:
+        """Look the terms up.
+
+        Raises:
+            ConfigError: Unknown term or parameter.
+        """
+        terms = {name: values for name, values in config.terms.items() if values is not None}
+        self.names = list(terms)
+        self.is_termination = torch.tensor([n == "termination" for n in terms], device=device)
+        self._terms = [_bind(name, values) for name, values in terms.items()]
+        scale = step_dt if config.scale_by_dt else 1.0
+        weights = [float(values["weight"]) * scale for values in terms.values()]
+        self._weights = torch.tensor(weights, device=device)
+
+    def __call__(self, step: Step) -> torch.Tensor:
+        """Return the weighted terms, (N, number of terms)."""
+        return torch.stack([term(step) for term in self._terms], dim=1) * self._weights
+
+
+def _bind(name: str, values: dict) -> Callable[[Step], torch.Tensor]:
+    function = find_function(globals(), name, Step, where="env.rewards.terms")
+    parameters = {key: value for key, value in values.items() if key != "weight"}
+    allowed = list(inspect.signature(function).parameters)[1:]
+    unknown = [key for key in parameters if key not in allowed]
+    if unknown or "weight" not in values:
+        problem = f"unknown parameter '{unknown[0]}'" if unknown else "no weight"
+        raise ConfigError(
+            f"env.rewards.terms.{name}: {problem}; it takes {', '.join(['weight', *allowed])}"
+        )
+    try:
+        inspect.signature(function).bind(None, **parameters)
+    except TypeError as error:
+        raise ConfigError(f"env.rewards.terms.{name}: {error}") from None
+    return partial(function, **parameters)

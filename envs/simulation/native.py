@@ -1,0 +1,152 @@
+"""C MuJoCo on every core, through `mujoco.batch`: the default on a CPU."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+import torch
+from mujoco.batch import Batch
+
+from kiras_rl.envs.simulation.base import OVERFLOW_WARNINGS, RANDOMISED_FIELDS
+
+_VELOCITY_STAGE = int(mujoco.mjtStage.mjSTAGE_VEL)
+_OVERFLOW = [int(w) for w in OVERFLOW_WARNINGS]
+_BAD_STATE = [
+    int(mujoco.mjtWarning.mjWARN_BADQPOS),
+    int(mujoco.mjtWarning.mjWARN_BADQVEL),
+    int(mujoco.mjtWarning.mjWARN_BADQACC),
+    int(mujoco.mjtWarning.mjWARN_BADCTRL),
+]
+
+
+class NativeSimulation:
+    """The Simulation protocol over `mujoco.batch.Batch`; see base.py for the members.
+
+    States live in float64 inside the batch and are handed out as float32 tensors. Results do not
+    depend on the number of threads.
+    """
+
+    def __init__(
+        self, model: mujoco.MjModel, num_worlds: int, substeps: int, threads: int = 0
+    ) -> None:
+        """Allocate the worlds.
+
+        Args:
+            model: The scene with the sensors that the environment reads.
+            num_worlds: N.
+            substeps: Physics steps in a control step, K.
+            threads: Threads of the pool; 0 for one a core.
+        """
+        # A diverged world must stay visible: MuJoCo would silently reset it.
+        model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
+        self.model = model
+        self.num_worlds = num_worlds
+        self.device = torch.device("cpu")
+        self._substeps = substeps
+        self._batch = Batch(model, num_worlds, threads)
+        self._batch.reset(stage=int(mujoco.mjtStage.mjSTAGE_NONE))
+        self._fields = {name: self._batch.expand(name) for name in RANDOMISED_FIELDS}
+        self._bind_state()
+        self._allocate_outputs()
+        self._batch.set_const()  # so that the constants, too, hold one value a world
+        self.forward()
+
+    def _bind_state(self) -> None:
+        batch = self._batch
+        self._qpos, self._qvel = batch.bind("qpos"), batch.bind("qvel")
+        self._ctrl, self._time = batch.bind("ctrl"), batch.bind("time")
+        self._warmstart = batch.bind("qacc_warmstart")
+        self._sensordata = batch.bind("sensordata")
+        self._history_samples = int(self.model.actuator_history[:, 0].max(initial=0))
+        self._history = batch.bind("history") if self._history_samples else None
+        fresh = mujoco.MjData(self.model).history
+        self._fresh_history = fresh.reshape(self.model.nu, -1).copy()
+
+    def _allocate_outputs(self) -> None:
+        n, model = self.num_worlds, self.model
+        self._record = np.zeros((n, self._substeps, model.nsensordata))
+        self._warnings = self._batch.warning[..., 1].copy()
+        self.qpos = torch.zeros(n, model.nq)
+        self.qvel = torch.zeros(n, model.nv)
+        self.sensors = torch.zeros(n, model.nsensordata)
+        self.sensor_record = torch.zeros(n, self._substeps, model.nsensordata)
+        self.overflowed = torch.zeros(n, dtype=torch.bool)
+        self.diverged = torch.zeros(n, dtype=torch.bool)
+
+    def step(self, ctrl: torch.Tensor) -> None:
+        """Advance every world by one control step."""
+        self._ctrl[:] = ctrl.numpy()
+        self._batch.rollout(self._substeps, record=["sensordata"], out={"sensordata": self._record})
+        self.sensor_record.numpy()[:] = self._record
+        self._read_state()
+        self._read_warnings()
+
+    def _read_state(self) -> None:
+        self.qpos.numpy()[:] = self._qpos
+        self.qvel.numpy()[:] = self._qvel
+
+    def _read_warnings(self) -> None:
+        counts = self._batch.warning[..., 1]  # mjWarningStat.number
+        risen = counts > self._warnings
+        self._warnings[:] = counts
+        finite = np.isfinite(self._qpos).all(1) & np.isfinite(self._qvel).all(1)
+        self.overflowed.copy_(torch.from_numpy(risen[:, _OVERFLOW].any(1)))
+        self.diverged.copy_(torch.from_numpy(risen[:, _BAD_STATE].any(1) | ~finite))
+
+    def write_state(
+        self, mask: torch.Tensor, qpos: torch.Tensor, qvel: torch.Tensor, ctrl: torch.Tensor
+    ) -> None:
+        """Set the state of the masked worlds and forget their past."""
+        ids = mask.nonzero().squeeze(1)
+        rows = ids.numpy()
+        self._qpos[rows] = qpos[ids].numpy()
+        self._qvel[rows] = qvel[ids].numpy()
+        self._ctrl[rows] = ctrl[ids].numpy()
+        self._warmstart[rows] = 0.0
+        self._time[rows] = 0.0
+        if self._history is not None:
+            self._fill_history(rows, ctrl[ids].numpy())
+        self.qpos[ids], self.qvel[ids] = qpos[ids], qvel[ids]
+
+    def _fill_history(self, rows: np.ndarray, ctrl: np.ndarray) -> None:
+        # One buffer an actuator: [two cursors, n times, n values] (mjData.history).
+        n = self._history_samples
+        buffers = self._history.reshape(self.num_worlds, self.model.nu, 2 + 2 * n)
+        buffers[rows] = self._fresh_history
+        buffers[rows, :, 2 + n :] = ctrl[:, :, None]
+
+    def write_velocity(self, mask: torch.Tensor, qvel: torch.Tensor) -> None:
+        """Set the velocities of the masked worlds."""
+        ids = mask.nonzero().squeeze(1)
+        self._qvel[ids.numpy()] = qvel[ids].numpy()
+        self.qvel[ids] = qvel[ids]
+
+    def write_field(self, name: str, mask: torch.Tensor, values: torch.Tensor) -> None:
+        """Set one of RANDOMISED_FIELDS in the masked worlds."""
+        ids = mask.nonzero().squeeze(1)
+        self._fields[name][ids.numpy()] = values[ids].numpy()
+
+    def set_const(self, mask: torch.Tensor) -> None:
+        """Recompute the constants that depend on masses in the masked worlds."""
+        ids = mask.nonzero().squeeze(1)
+        if len(ids):
+            self._batch.set_const(ids.numpy())
+
+    def forward(self) -> None:
+        """Compute position and velocity sensors at the current state of every world."""
+        self._batch.forward(stage=_VELOCITY_STAGE)
+        self.sensors.numpy()[:] = self._sensordata
+
+    def state_dict(self) -> dict[str, torch.Tensor]:
+        """Return all that the next steps depend on."""
+        state = {f"field/{name}": torch.tensor(x) for name, x in self._fields.items()}
+        return state | {"state": torch.tensor(self._batch.state)}
+
+    def load_state_dict(self, state: dict[str, torch.Tensor]) -> None:
+        """Go on from a saved state."""
+        for name, field in self._fields.items():
+            field[:] = state[f"field/{name}"].numpy()
+        self._batch.set_const()
+        self._batch.state[:] = state["state"].numpy()
+        self._read_state()
+        self.forward()

@@ -1,0 +1,178 @@
+"""What the robot does, in words: named quantities read from the simulation, and the task.
+
+Frames: _w world, _b base, _h heading (the world rotated by the base's yaw). All memory of the
+environment lives here; rewards, observations and terminations are functions of it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+
+from kiras_rl.envs import rotations
+from kiras_rl.envs.model import SensorLayout
+from kiras_rl.envs.simulation.base import Simulation
+from kiras_rl.robots.robot import Robot
+
+CONTACT_FORCE = 1.0  # N; a foot that presses harder than this stands
+
+
+class RobotState:
+    """Named quantities of N robots with J joints, F feet, L other penalised geoms.
+
+    `read_step` fills everything after a control step; `read_kinematics` renews what a reset or a
+    push changed. Contacts and torques keep the values of the step.
+    """
+
+    def __init__(self, sim: Simulation, layout: SensorLayout, robot: Robot) -> None:
+        """Bind to a simulation."""
+        self._sim = sim
+        self._layout = layout
+        self._foot_radius = robot.foot_radius
+        self._num_feet = len(robot.foot_geoms)
+        self.read_kinematics()
+        self._read_contacts()
+
+    @classmethod
+    def at_rest(cls, keyframes: Keyframes, skill: torch.Tensor, num_feet: int) -> RobotState:
+        """Return robots standing still on the ground in the keyframes `skill`, (N,).
+
+        They belong to no simulation: only base, joints and foot heights are set.
+        """
+        robot = cls.__new__(cls)
+        zero = torch.zeros(len(skill), 3, device=skill.device)
+        robot.base_height = keyframes.height[skill]
+        robot.base_lin_vel_b = robot.base_lin_vel_h = robot.base_ang_vel_b = zero
+        robot.gravity_b = keyframes.gravity_b[skill]
+        robot.roll_pitch = rotations.roll_pitch(robot.gravity_b)
+        robot.joint_pos = keyframes.joint_pos[skill]
+        robot.joint_vel = torch.zeros_like(robot.joint_pos)
+        robot.foot_height = torch.zeros(len(skill), num_feet, device=skill.device)
+        return robot
+
+    def read_step(self) -> None:
+        """Read everything after a control step."""
+        self._read_base()
+        self._read_contacts()
+
+    def read_kinematics(self) -> None:
+        """Read the state and the position sensors after `Simulation.forward`."""
+        self._read_base()
+        # Height of the lowest point of each foot above the ground, (N, F), m
+        pos = self._sim.sensors[:, self._layout.foot_pos_w].unflatten(1, (self._num_feet, 3))
+        self.foot_height = pos[..., 2] - self._foot_radius
+
+    def _read_base(self) -> None:
+        qpos, qvel = self._sim.qpos, self._sim.qvel
+        self.base_pos_w = qpos[:, :3]  # (N, 3), m
+        self.base_height = qpos[:, 2]  # above the ground under the base, (N,), m
+        self.base_quat_w = quat = qpos[:, 3:7]  # (N, 4)
+        self.base_ang_vel_b = qvel[:, 3:6]  # (N, 3), rad/s
+        self.base_lin_vel_b = rotations.rotate_inverse(quat, qvel[:, :3])  # (N, 3), m/s
+        self.base_lin_vel_h = rotations.to_heading_frame(quat, qvel[:, :3])  # (N, 3), m/s
+        self.gravity_b = rotations.projected_gravity(quat)  # (N, 3), unit vector
+        self.roll_pitch = rotations.roll_pitch(self.gravity_b)  # (N, 2), rad
+        # Rotation about the vertical, (N,), rad/s
+        self.yaw_rate = -(self.gravity_b * self.base_ang_vel_b).sum(-1)
+        self.joint_pos = qpos[:, 7:]  # (N, J), rad
+        self.joint_vel = qvel[:, 6:]  # (N, J), rad/s
+
+    def _read_contacts(self) -> None:
+        record, layout = self._sim.sensor_record, self._layout
+        # Largest force of the physics steps, so that no short contact is missed, (N, ...), N
+        self.foot_force = _peak_force(record[:, :, layout.foot_force_w])
+        self.base_force = _peak_force(record[:, :, layout.base_force_w])
+        self.limb_force = _peak_force(record[:, :, layout.limb_force_w])
+        last = record[:, -1]
+        self.foot_contact = _force(last[:, layout.foot_force_w]) > CONTACT_FORCE  # (N, F) bool
+        self.foot_vel_w = last[:, layout.foot_vel_w].unflatten(1, (-1, 3))  # (N, F, 3), m/s
+        self.joint_torque = last[:, layout.joint_torque]  # (N, J), N m
+
+
+@dataclass
+class Task:
+    """What each world is asked to do.
+
+    Attributes:
+        command: v_x, v_y in the heading frame and yaw rate, (N, 3), m/s and rad/s.
+        skill: Index of the commanded skill, (N,) int64.
+        start: Index of the keyframe where the episode began, (N,) int64.
+    """
+
+    command: torch.Tensor
+    skill: torch.Tensor
+    start: torch.Tensor
+
+
+@dataclass(frozen=True)
+class Keyframes:
+    """The keyframes of a robot as tensors, S rows.
+
+    Attributes:
+        height: Base height, (S,), m.
+        pitch: Nose down positive, (S,), rad.
+        joint_pos: (S, J), rad.
+        gravity_b: Projected gravity, (S, 3).
+    """
+
+    height: torch.Tensor
+    pitch: torch.Tensor
+    joint_pos: torch.Tensor
+    gravity_b: torch.Tensor
+
+    @classmethod
+    def of(cls, robot: Robot, device: torch.device) -> Keyframes:
+        """Collect the keyframes of a robot."""
+
+        def tensor(values: list) -> torch.Tensor:
+            return torch.tensor(values, dtype=torch.float32, device=device)
+
+        pitch = tensor([k.pitch for k in robot.keyframes])
+        zero = torch.zeros_like(pitch)
+        return cls(
+            height=tensor([k.base_height for k in robot.keyframes]),
+            pitch=pitch,
+            joint_pos=tensor([list(k.joint_pos) for k in robot.keyframes]),
+            gravity_b=torch.stack([torch.sin(pitch), zero, -torch.cos(pitch)], dim=-1),
+        )
+
+
+@dataclass
+class Step:
+    """One control step as rewards and terminations see it, before resets.
+
+    Attributes:
+        robot: The robots after the step.
+        task: Their tasks.
+        keyframes: The skills.
+        action: Clipped action of this step, (N, J).
+        last_action: Clipped action of the step before, (N, J).
+        last_joint_vel: Before the step, (N, J), rad/s.
+        last_joint_torque: Before the step, (N, J), N m.
+        fresh: Worlds in the first step of an episode, (N,) bool; differences to the step before
+            are zero there.
+        fallen: Worlds that terminate by failure, (N,) bool.
+        dt: Duration of the step, s.
+    """
+
+    robot: RobotState
+    task: Task
+    keyframes: Keyframes
+    action: torch.Tensor
+    last_action: torch.Tensor
+    last_joint_vel: torch.Tensor
+    last_joint_torque: torch.Tensor
+    fresh: torch.Tensor
+    fallen: torch.Tensor
+    dt: float
+
+
+def _force(flat: torch.Tensor) -> torch.Tensor:
+    """Return magnitudes of the forces in (..., 3 G), as (..., G)."""
+    return torch.linalg.vector_norm(flat.unflatten(-1, (-1, 3)), dim=-1)
+
+
+def _peak_force(record: torch.Tensor) -> torch.Tensor:
+    """Return the largest magnitude over the physics steps of (N, K, 3 G), as (N, G)."""
+    return _force(record).amax(dim=1)

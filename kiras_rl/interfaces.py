@@ -1,0 +1,146 @@
+"""The contract between learning and simulation: every name that crosses it, with its shape.
+
+Letters: N worlds, P proprioceptive numbers, H frames of history, C critic numbers, D imitation
+features, S skills, F feet.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from dataclasses import dataclass
+
+import torch
+from rsl_rl.env import VecEnv
+from tensordict import TensorDict
+
+PROPRIO = "proprio"
+"""What the robot measures at this step, with noise, (N, P)."""
+
+HISTORY = "history"
+"""The H frames of `proprio` before this one, oldest first, (N, H * P)."""
+
+CRITIC = "critic"
+"""Noise-free observation with privileged terms, (N, C)."""
+
+IMITATION = "imitation"
+"""Phi, the features compared with keyframes, noise-free, (N, D)."""
+
+VELOCITY = "velocity"
+"""Base linear velocity in the base frame, the estimator's target, (N, 3), m/s."""
+
+SKILL = "skill"
+"""One-hot code of the commanded skill, (N, S)."""
+
+COMMAND = "command"
+"""Commanded v_x, v_y in the heading frame and yaw rate, (N, 3), m/s and rad/s."""
+
+CONTEXT = "context"
+"""Output of the context estimator; written by the learner, never by the environment."""
+
+NEXT_PROPRIO = "next_proprio"
+"""Noise-free `proprio` after the step and before a reset, (N, P); extras, then storage."""
+
+EXTRA_TIME_OUTS = "time_outs"
+"""Episodes that ended by the clock, (N,) bool."""
+
+EXTRA_IMITATION = "imitation"
+"""Phi after the step and before a reset, (N, D)."""
+
+EXTRA_VALID = "imitation_valid"
+"""Whether Phi before and after the step belong to one undisturbed motion, (N,) bool."""
+
+
+@dataclass(frozen=True)
+class Measurements:
+    """What an evaluation reads after a step, before automatic resets; shapes (N,) if not given.
+
+    Attributes:
+        base_height: Base origin above the ground under the base, m.
+        pitch: Nose down positive, rad.
+        roll: rad.
+        lin_vel_h: Base velocity in the heading frame, (N, 3), m/s.
+        yaw_rate: rad/s about the vertical.
+        foot_contact: Feet on the ground, (N, F) bool.
+        fallen: Worlds that terminate by failure at this step, bool.
+    """
+
+    base_height: torch.Tensor
+    pitch: torch.Tensor
+    roll: torch.Tensor
+    lin_vel_h: torch.Tensor
+    yaw_rate: torch.Tensor
+    foot_contact: torch.Tensor
+    fallen: torch.Tensor
+
+
+class SkillEnv(VecEnv):
+    """A vectorised environment of one robot with S skills.
+
+    `get_observations` and `step` return the groups above in a new TensorDict each time, never
+    aliased to a buffer that the next step overwrites.
+    """
+
+    skills: tuple[str, ...]
+    """Names of the skills, in the order of their one-hot code."""
+
+    step_dt: float
+    """Duration of a control step, s."""
+
+    keyframe_features: torch.Tensor
+    """Phi of each skill's keyframe, (S, D)."""
+
+    feature_noise: torch.Tensor
+    """Standard deviation of one unit of discriminator input noise in each feature, (D,)."""
+
+    keyframe_height: torch.Tensor
+    """Base height of each keyframe, (S,), m."""
+
+    keyframe_pitch: torch.Tensor
+    """Pitch of each keyframe, (S,), rad."""
+
+    @abstractmethod
+    def seed(self, seed: int) -> None:
+        """Restart the environment's random numbers."""
+
+    @abstractmethod
+    def reset(
+        self, skill: torch.Tensor | None = None, command: torch.Tensor | None = None
+    ) -> TensorDict:
+        """Reset every world.
+
+        Args:
+            skill: Skill index to start and stay in, (N,), or None to draw it.
+            command: Command, (N, 3), or None to draw it.
+        """
+
+    @abstractmethod
+    def set_task(self, skill: torch.Tensor, command: torch.Tensor) -> TensorDict:
+        """Give every world a new skill (N,) and command (N, 3); return the observation of it."""
+
+    @abstractmethod
+    def set_skill_probabilities(self, probabilities: torch.Tensor) -> None:
+        """Set the probabilities with which new skills are drawn, (S,)."""
+
+    @abstractmethod
+    def keyframe_observations(self) -> torch.Tensor:
+        """Return critic observations at rest in each keyframe.
+
+        Returns:
+            Observations for G commands spread over the command range, (S, G, C).
+        """
+
+    @abstractmethod
+    def measure(self) -> Measurements:
+        """Return the measurements of the last step."""
+
+    @abstractmethod
+    def describe(self) -> dict:
+        """Return what a deployed policy must know, as kiras_rl.deploy.metadata spells it."""
+
+    @abstractmethod
+    def state_dict(self) -> dict:
+        """Return everything the next steps depend on: tensors and plain numbers only."""
+
+    @abstractmethod
+    def load_state_dict(self, state: dict) -> None:
+        """Go on from a saved state."""
