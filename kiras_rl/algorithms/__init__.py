@@ -1,0 +1,1 @@
+"""Learning algorithms: PPO with two critics, its losses, returns and storage."""

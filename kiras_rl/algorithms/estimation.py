@@ -1,0 +1,148 @@
+"""Context estimation: what the actor is told about velocity and terrain, and how it is learned."""
+
+from __future__ import annotations
+
+import torch
+from tensordict import TensorDict
+
+from kiras_rl import interfaces as names
+from kiras_rl.algorithms.adaboot import MODES, AdaBoot
+from kiras_rl.algorithms.losses import gaussian_kl, masked_mse
+from kiras_rl.algorithms.storage import GroupRolloutStorage, mini_batches
+from kiras_rl.config import ConfigError, EstimatorConfig
+from kiras_rl.interfaces import SkillEnv
+from kiras_rl.models.estimator import VELOCITY_DIM, ContextEstimator
+
+VELOCITY_SCALE = 2.0  # in the loss: velocity errors then weigh as much as observation errors
+
+
+class Estimation:
+    """The estimator, its optimizer and AdaBoot."""
+
+    def __init__(
+        self,
+        config: EstimatorConfig,
+        estimator: ContextEstimator,
+        num_envs: int,
+        device: str,
+    ) -> None:
+        """Take the network.
+
+        Raises:
+            ConfigError: Unknown AdaBoot mode.
+        """
+        if config.adaboot not in MODES:
+            raise ConfigError(
+                f"learner.estimator.adaboot={config.adaboot}: allowed are {', '.join(MODES)}"
+            )
+        self.config = config
+        self.estimator = estimator.to(device)
+        self.optimizer = torch.optim.Adam(
+            self.estimator.parameters(), lr=config.learning_rate, fused=True
+        )
+        self.adaboot = AdaBoot(config.adaboot, config.adaboot_floor, num_envs, device)
+
+    @classmethod
+    def build(
+        cls, config: EstimatorConfig | None, obs: TensorDict, env: SkillEnv, device: str
+    ) -> Estimation | None:
+        """Build for an environment, or return None where the configuration has no estimator."""
+        if config is None:
+            return None
+        proprio = obs[names.PROPRIO].shape[1]
+        estimator = ContextEstimator(
+            proprio_dim=proprio,
+            history_length=obs[names.HISTORY].shape[1] // proprio,
+            num_skills=len(env.skills),
+            latent_dim=config.latent_dim,
+            encoder_dims=list(config.encoder_dims),
+            decoder_dims=list(config.decoder_dims),
+        )
+        return cls(config, estimator, len(obs), device)
+
+    @torch.no_grad()
+    def context(self, obs: TensorDict) -> torch.Tensor:
+        """Return the actor's context, (N, 3 + Z).
+
+        With AdaBoot on the input, worlds that do not trust the estimate are told the true velocity.
+        """
+        context = self.estimator.context(obs[names.HISTORY])
+        if self.adaboot.bootstraps_input:
+            told = self.adaboot.uses_estimate[:, None]
+            velocity = torch.where(told, context[:, :VELOCITY_DIM], obs[names.VELOCITY])
+            context = torch.cat([velocity, context[:, VELOCITY_DIM:]], dim=-1)
+        return context
+
+    def record(self, rewards: torch.Tensor, dones: torch.Tensor) -> None:
+        """Let AdaBoot see a step's rewards and dones, (N,)."""
+        self.adaboot.record(rewards, dones)
+
+    def update(self, storage: GroupRolloutStorage, num_mini_batches: int) -> dict[str, float]:
+        """Train on the rollout unless AdaBoot withholds it; return scalars for the log."""
+        self.adaboot.renew()
+        trained = self.adaboot.update_allowed()
+        scalars = {
+            "AdaBoot/trust": self.adaboot.probability.item(),
+            "AdaBoot/trained": float(trained),
+        }
+        if trained:
+            scalars |= self._train(storage, num_mini_batches)
+        return scalars
+
+    def _train(self, storage: GroupRolloutStorage, num_mini_batches: int) -> dict[str, float]:
+        obs = storage.observations
+        data = storage.shuffled(
+            history=obs[names.HISTORY],
+            velocity=obs[names.VELOCITY],
+            target=obs[names.NEXT_PROPRIO],
+            skill=obs[names.SKILL],
+            goes_on=storage.dones == 0,
+        )
+        totals = torch.zeros(4, device=storage.device)
+        for batch in mini_batches(data, num_mini_batches, self.config.epochs):
+            parts = self._losses(**batch)
+            velocity, prediction, kl, prior = parts
+            loss = velocity * VELOCITY_SCALE**2 + prediction
+            loss = loss + self.config.kl_weight * kl + self.config.prior_weight * prior
+            self.optimizer.zero_grad()
+            loss.backward()
+            self.optimizer.step()
+            totals += torch.stack(parts).detach()
+        means = (totals / (num_mini_batches * self.config.epochs)).tolist()
+        tags = ("velocity", "prediction", "kl", "prior")
+        return {f"Estimator/{tag}": value for tag, value in zip(tags, means, strict=True)}
+
+    def _losses(
+        self,
+        history: torch.Tensor,
+        velocity: torch.Tensor,
+        target: torch.Tensor,
+        skill: torch.Tensor,
+        goes_on: torch.Tensor,
+    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Return errors of velocity ((m/s)^2) and prediction, KL to the prior, KL of the prior."""
+        estimate, mean, log_var = self.estimator(history)
+        latent = mean + torch.randn_like(mean) * torch.exp(0.5 * log_var)
+        prediction = self.estimator.decode(latent, skill)
+        prior_mean, prior_log_var = self.estimator.prior_of(skill)
+        zero = torch.zeros_like(prior_mean)
+        return (
+            (estimate - velocity).square().mean(),
+            masked_mse(prediction, target, goes_on.squeeze(-1)),  # an end has no next frame
+            gaussian_kl(mean, log_var, prior_mean, prior_log_var).mean(),
+            gaussian_kl(prior_mean, prior_log_var, zero, zero).mean(),
+        )
+
+    def state_dict(self) -> dict:
+        """Return network, optimizer and AdaBoot."""
+        return {
+            "estimator": self.estimator.state_dict(),
+            "optimizer": self.optimizer.state_dict(),
+            "adaboot": self.adaboot.state_dict(),
+        }
+
+    def load_state_dict(self, state: dict) -> None:
+        """Go on from a saved state."""
+        self.estimator.load_state_dict(state["estimator"])
+        self.optimizer.load_state_dict(state["optimizer"])
+        self.adaboot.load_state_dict(state["adaboot"])

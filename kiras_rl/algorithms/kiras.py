@@ -1,0 +1,354 @@
+"""KirasPPO: PPO with two critics, self-imitation, a context estimator and skill selection."""
+
+from __future__ import annotations
+
+from itertools import chain
+
+import torch
+from rsl_rl.algorithms import PPO
+from rsl_rl.models import MLPModel
+from tensordict import TensorDict
+from torch import nn
+
+from kiras_rl import interfaces as names
+from kiras_rl.algorithms import losses, returns
+from kiras_rl.algorithms.estimation import Estimation
+from kiras_rl.algorithms.storage import GroupRolloutStorage, mini_batches
+from kiras_rl.config import LearnerConfig
+from kiras_rl.imitation.self_imitation import SelfImitation
+from kiras_rl.interfaces import SkillEnv
+from kiras_rl.models.critics import GroupCritic
+from kiras_rl.models.exported import ExportedPolicy
+from kiras_rl.schedules import advantage_weights, piecewise_linear
+from kiras_rl.skills import SkillSampler
+
+TASK, IMITATION = 0, 1  # reward groups
+
+
+class KirasPPO(PPO):
+    """The learner. Parts that the configuration sets to null do not exist.
+
+    Letters: T steps, N worlds, G reward groups (task, imitation), S skills.
+    """
+
+    actor: MLPModel
+    critic: GroupCritic
+    storage: GroupRolloutStorage
+
+    def __init__(
+        self,
+        actor: MLPModel,
+        critic: GroupCritic,
+        storage: GroupRolloutStorage,
+        config: LearnerConfig,
+        iterations: int,
+        imitation: SelfImitation | None,
+        estimation: Estimation | None,
+        sampler: SkillSampler | None,
+        device: str,
+    ) -> None:
+        """Take the parts; see `construct_algorithm`."""
+        ppo = config.ppo
+        super().__init__(
+            actor,
+            critic,
+            storage,
+            num_learning_epochs=ppo.num_epochs,
+            num_mini_batches=ppo.num_mini_batches,
+            clip_param=ppo.clip_param,
+            gamma=ppo.gamma,
+            lam=ppo.lam,
+            value_loss_coef=ppo.value_loss_coef,
+            entropy_coef=ppo.entropy_coef,
+            learning_rate=ppo.learning_rate,
+            max_grad_norm=ppo.max_grad_norm,
+            desired_kl=ppo.desired_kl,
+            device=device,
+        )
+        parameters = chain(actor.parameters(), critic.parameters())
+        self.optimizer = torch.optim.Adam(parameters, lr=ppo.learning_rate, fused=True)
+        self.config = config
+        self.iterations = iterations
+        self.iteration = 0
+        self.imitation, self.estimation, self.sampler = imitation, estimation, sampler
+        self._apply_schedules()
+
+    @property
+    def progress(self) -> float:
+        """How much of skill learning is done, t / T1."""
+        return self.iteration / self.iterations
+
+    # --- rollout --------------------------------------------------------------------------------
+
+    def act(self, obs: TensorDict) -> torch.Tensor:
+        """Sample actions (N, J); the context is computed once, here, and stored with the step."""
+        if self.estimation:
+            obs[names.CONTEXT] = self.estimation.context(obs)
+        return super().act(obs)
+
+    def act_deterministic(self, obs: TensorDict) -> torch.Tensor:
+        """Return mean actions (N, J) as the exported policy computes them."""
+        with torch.inference_mode():
+            return self.policy()(obs[names.PROPRIO], obs[names.HISTORY])[0]
+
+    def policy(self) -> ExportedPolicy:
+        """Return estimator and actor as the module that is exported."""
+        estimator = self.estimation.estimator if self.estimation else None
+        return ExportedPolicy(estimator, self.actor.mlp)
+
+    def process_env_step(
+        self, obs: TensorDict, rewards: torch.Tensor, dones: torch.Tensor, extras: dict
+    ) -> None:
+        """Record one environment step.
+
+        Args:
+            obs: Observation after the step; not used, what counts is in extras.
+            rewards: Task reward, (N,).
+            dones: Ended episodes, (N,).
+            extras: See kiras_rl.interfaces.
+        """
+        step = self.transition
+        before = step.observations
+        before[names.NEXT_PROPRIO] = extras[names.NEXT_PROPRIO]
+        grouped = self._group_rewards(before, rewards, dones, extras)
+        # rsl-rl's convention: an episode cut by the clock goes on with the value where it began
+        time_outs = extras[names.EXTRA_TIME_OUTS].unsqueeze(1)
+        step.rewards = grouped + self.gamma * step.values * time_outs
+        step.dones = dones
+        if self.estimation:
+            self.estimation.record(rewards, dones)
+        self.storage.add_transition(step)
+        step.clear()
+
+    def _group_rewards(
+        self, before: TensorDict, rewards: torch.Tensor, dones: torch.Tensor, extras: dict
+    ) -> torch.Tensor:
+        """Return task and imitation rewards, (N, G); summed where there is one critic."""
+        task = rewards.clamp(min=0.0) if self.config.ppo.only_positive_rewards else rewards
+        if self.imitation is None:
+            return task.unsqueeze(1)
+        imitation = self.imitation.record(before, rewards, dones, extras)
+        if self.config.multi_critic is None:
+            return (task + imitation).unsqueeze(1)
+        return torch.stack([task, imitation], dim=1)
+
+    def compute_returns(self, obs: TensorDict) -> None:
+        """Compute returns of each group and one mixed advantage."""
+        st = self.storage
+        advantages = returns.generalized_advantages(
+            st.rewards, st.values, self.critic(obs), st.dones, self.gamma, self.lam
+        )
+        st.returns = advantages + st.values
+        st.advantages = returns.mix_advantages(advantages, self._weights(), self._std_floor())
+
+    def _weights(self) -> tuple[float, ...]:
+        mix = self.config.multi_critic
+        if mix is None or self.imitation is None:
+            return (1.0,)
+        return advantage_weights(self.progress, mix.sigma, mix.omega2_floor)
+
+    def _std_floor(self) -> float:
+        mix = self.config.multi_critic
+        return mix.std_floor if mix else 1e-8
+
+    # --- update ---------------------------------------------------------------------------------
+
+    def update(self) -> dict[str, float]:
+        """Train every part on the rollout; return scalars for the log, by their full names."""
+        scalars = self._describe_rollout()
+        scalars |= self._update_policy()
+        if self.estimation:
+            scalars |= self.estimation.update(self.storage, self.num_mini_batches)
+        if self.imitation:
+            scalars |= self.imitation.update(self.storage, self.iteration, self.progress)
+        self.storage.clear()
+        self.iteration += 1
+        self._apply_schedules()
+        return scalars
+
+    def _update_policy(self) -> dict[str, float]:
+        st = self.storage
+        mean, std = st.distribution_params
+        data = st.shuffled(
+            actor_obs=self.actor.get_latent(st.observations),
+            critic_obs=st.observations[names.CRITIC],
+            actions=st.actions,
+            old_log_prob=st.actions_log_prob,
+            advantages=st.advantages,
+            returns=st.returns,
+            mean=mean,
+            std=std,
+        )
+        totals = torch.zeros(4, device=self.device)
+        for batch in mini_batches(data, self.num_mini_batches, self.num_learning_epochs):
+            totals += self._policy_step(batch)
+        surrogate, value, entropy, kl = (
+            totals / (self.num_mini_batches * self.num_learning_epochs)
+        ).tolist()
+        return {
+            "Loss/surrogate": surrogate,
+            "Loss/value": value,
+            "Loss/entropy": entropy,
+            "Policy/kl": kl,
+            "Policy/learning_rate": self.learning_rate,
+            "Policy/action_std": self.actor.output_std.mean().item(),
+        }
+
+    def _policy_step(self, batch: dict[str, torch.Tensor]) -> torch.Tensor:
+        """Take one gradient step; return (surrogate, value, entropy, KL), (4,)."""
+        distribution = self.actor.distribution
+        distribution.update(self.actor.mlp(batch["actor_obs"]))
+        log_prob = distribution.log_prob(batch["actions"])
+        kl = self._adapt_to_kl((batch["mean"], batch["std"]))
+        values = self.critic({names.CRITIC: batch["critic_obs"]})
+        surrogate = losses.surrogate_loss(
+            log_prob, batch["old_log_prob"].squeeze(1), batch["advantages"].squeeze(1),
+            self.clip_param,
+        )  # fmt: skip
+        value = losses.value_loss(values, batch["returns"])
+        entropy = distribution.entropy.mean()
+        loss = surrogate + self.value_loss_coef * value - self.entropy_coef * entropy
+        self.optimizer.zero_grad()
+        loss.backward()
+        for network in (self.actor, *self.critic.critics):
+            nn.utils.clip_grad_norm_(network.parameters(), self.max_grad_norm)
+        self.optimizer.step()
+        return torch.stack([surrogate, value, entropy, kl]).detach()
+
+    @torch.no_grad()
+    def _adapt_to_kl(self, old_params: tuple[torch.Tensor, ...]) -> torch.Tensor:
+        """Adapt the learning rate to the mean KL divergence from the rollout's policy."""
+        distribution = self.actor.distribution
+        kl = distribution.kl_divergence(old_params, distribution.params).mean()
+        self.learning_rate = losses.adapt_learning_rate(
+            self.learning_rate, kl.item(), self.desired_kl, self.config.ppo.learning_rate_range
+        )
+        for group in self.optimizer.param_groups:
+            group["lr"] = self.learning_rate
+        return kl
+
+    def _apply_schedules(self) -> None:
+        """Lower the cap of the action noise: noise must not carry the gait."""
+        cap = piecewise_linear(self.config.ppo.std_cap, self.progress)
+        distribution = self.actor.distribution
+        distribution.log_std_range[1] = float(torch.tensor(cap).log())
+
+    # --- skills ---------------------------------------------------------------------------------
+
+    def skill_probabilities(self, keyframe_observations: torch.Tensor) -> torch.Tensor | None:
+        """Renew the skill probabilities from the task critic; None where skills are uniform.
+
+        Args:
+            keyframe_observations: Critic observations at the keyframes, (S, commands, C).
+        """
+        if self.sampler is None:
+            return None
+        with torch.no_grad():
+            values = self.critic({names.CRITIC: keyframe_observations.flatten(0, 1)})[:, TASK]
+        values = values.unflatten(0, keyframe_observations.shape[:2]).mean(dim=1)
+        self.sampler.update(values, self._practised)
+        return self.sampler.probabilities
+
+    def _describe_rollout(self) -> dict[str, float]:
+        st = self.storage
+        one_hot = st.observations[names.SKILL].flatten(0, 1)  # (T N, S)
+        self._practised = one_hot.sum(dim=0)
+        scalars = {"Policy/advantage_weight_task": self._weights()[TASK]}
+        groups = ("task", "imitation")[: st.rewards.shape[-1]]
+        for g, group in enumerate(groups):
+            scalars[f"Critic/{group}_reward"] = st.rewards[..., g].mean().item()
+            scalars[f"Critic/{group}_return"] = st.returns[..., g].mean().item()
+            scalars[f"Critic/{group}_value"] = st.values[..., g].mean().item()
+        return scalars
+
+    # --- construction, modes, state -------------------------------------------------------------
+
+    @staticmethod
+    def construct_algorithm(obs: TensorDict, env: SkillEnv, cfg: dict, device: str) -> KirasPPO:
+        """Build the networks for the observations of an environment.
+
+        Args:
+            obs: A first observation; gains the groups that the learner itself writes.
+            env: The environment.
+            cfg: rsl-rl's dictionary; `learner` holds the LearnerConfig, `iterations` is T1.
+            device: Where networks and storage live.
+        """
+        config: LearnerConfig = cfg["learner"]
+        ppo = config.ppo
+        estimation = Estimation.build(config.estimator, obs, env, device)
+        if estimation:
+            obs[names.CONTEXT] = estimation.context(obs)
+        obs[names.NEXT_PROPRIO] = torch.zeros_like(obs[names.PROPRIO])
+        imitation = SelfImitation.build(config.imitation, obs, env, ppo.num_steps, device)
+        groups = {
+            "actor": [names.PROPRIO, names.CONTEXT if estimation else names.HISTORY],
+            "critic": [names.CRITIC],
+        }
+        has_two = imitation is not None and config.multi_critic is not None
+        storage = GroupRolloutStorage(
+            env.num_envs, ppo.num_steps, 2 if has_two else 1, obs, env.num_actions, device
+        )
+        sampler = (
+            SkillSampler(config.skill_init, len(env.skills), device) if config.skill_init else None
+        )
+        return KirasPPO(
+            actor=_build_actor(obs, groups, env.num_actions, config).to(device),
+            critic=GroupCritic(obs, groups, 2 if has_two else 1, list(ppo.critic_dims)).to(device),
+            storage=storage,
+            config=config,
+            iterations=cfg["iterations"],
+            imitation=imitation,
+            estimation=estimation,
+            sampler=sampler,
+            device=device,
+        )
+
+    def train_mode(self) -> None:
+        """Do nothing: no network here behaves differently in training."""
+
+    def eval_mode(self) -> None:
+        """Do nothing, for the same reason."""
+
+    def save(self) -> dict:
+        """Return every network, optimizer and statistic."""
+        saved = super().save()
+        saved["iteration"] = self.iteration
+        saved["learning_rate"] = self.learning_rate
+        for name, part in self._parts().items():
+            saved[name] = part.state_dict()
+        if self.sampler:
+            saved["skill_probabilities"] = self.sampler.probabilities
+        return saved
+
+    def load(self, loaded_dict: dict, load_cfg: dict | None = None, strict: bool = True) -> bool:
+        """Load what `save` returned."""
+        super().load(loaded_dict, load_cfg, strict)
+        self.iteration = loaded_dict["iteration"]
+        self.learning_rate = loaded_dict["learning_rate"]
+        for name, part in self._parts().items():
+            part.load_state_dict(loaded_dict[name])
+        if self.sampler:
+            self.sampler.probabilities = loaded_dict["skill_probabilities"].to(self.device)
+        self._apply_schedules()
+        return True
+
+    def _parts(self) -> dict[str, SelfImitation | Estimation]:
+        parts = {"imitation": self.imitation, "estimation": self.estimation}
+        return {name: part for name, part in parts.items() if part is not None}
+
+
+def _build_actor(
+    obs: TensorDict, groups: dict[str, list[str]], num_actions: int, config: LearnerConfig
+) -> MLPModel:
+    distribution = {
+        "class_name": "GaussianDistribution",
+        "init_std": config.ppo.init_std,
+        "std_type": "log",
+    }
+    actor = MLPModel(
+        obs, groups, "actor", num_actions, list(config.ppo.actor_dims), "elu", False, distribution
+    )
+    # First actions near zero: the robot begins in its default pose, not in a random one.
+    nn.init.normal_(actor.mlp[-1].weight, std=0.01)
+    nn.init.zeros_(actor.mlp[-1].bias)
+    return actor

@@ -1,0 +1,65 @@
+"""Losses and the learning-rate rule as free functions."""
+
+from __future__ import annotations
+
+import torch
+
+
+def surrogate_loss(
+    log_prob: torch.Tensor, old_log_prob: torch.Tensor, advantage: torch.Tensor, clip: float
+) -> torch.Tensor:
+    """Return the clipped PPO objective, negated; all arguments (B,)."""
+    ratio = torch.exp(log_prob - old_log_prob)
+    clipped = ratio.clamp(1.0 - clip, 1.0 + clip)
+    return torch.max(-advantage * ratio, -advantage * clipped).mean()
+
+
+def value_loss(values: torch.Tensor, returns: torch.Tensor) -> torch.Tensor:
+    """Return the squared error summed over groups and averaged over the batch, (B, G).
+
+    Values are not clipped around the old ones: the clip range is a number of the ratio's scale and
+    would slow critics whose returns reach 100.
+    """
+    return (values - returns).square().mean(dim=0).sum()
+
+
+def adapt_learning_rate(
+    rate: float, kl: float, desired_kl: float, limits: tuple[float, float]
+) -> float:
+    """Return a lower rate where the policy moved too far, a higher one where it hardly moved."""
+    if kl > 2.0 * desired_kl:
+        return max(limits[0], rate / 1.5)
+    if 0.0 < kl < desired_kl / 2.0:
+        return min(limits[1], rate * 1.5)
+    return rate
+
+
+def discriminator_loss(
+    expert: torch.Tensor, policy: torch.Tensor, valid: torch.Tensor
+) -> torch.Tensor:
+    """Return the LSGAN loss E[(D - 1)^2] on experts + E[(D + 1)^2] on the policy.
+
+    Args:
+        expert: Scores of expert pairs, (B,).
+        policy: Scores of the policy's pairs, (B,).
+        valid: Which of the policy's pairs count, (B,) bool.
+    """
+    weight = valid.float()
+    policy_part = ((policy + 1.0).square() * weight).sum() / weight.sum().clamp(min=1.0)
+    return (expert - 1.0).square().mean() + policy_part
+
+
+def gaussian_kl(
+    mean: torch.Tensor, log_var: torch.Tensor, prior_mean: torch.Tensor, prior_log_var: torch.Tensor
+) -> torch.Tensor:
+    """Return KL(q || p) of diagonal Gaussians, summed over the last dimension, (N,)."""
+    var_ratio = torch.exp(log_var - prior_log_var)
+    shift = (mean - prior_mean).square() / torch.exp(prior_log_var)
+    return 0.5 * (prior_log_var - log_var + var_ratio + shift - 1.0).sum(-1)
+
+
+def masked_mse(prediction: torch.Tensor, target: torch.Tensor, mask: torch.Tensor) -> torch.Tensor:
+    """Return the mean squared error over the rows (N, k) that the mask (N,) keeps."""
+    weight = mask.float().unsqueeze(-1)
+    count = (weight.sum() * prediction.shape[-1]).clamp(min=1.0)
+    return ((prediction - target).square() * weight).sum() / count

@@ -1,0 +1,70 @@
+"""Rollout storage whose rewards, values and returns have one column a reward group."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import torch
+from rsl_rl.storage import RolloutStorage
+from tensordict import TensorDict
+
+
+class GroupRolloutStorage(RolloutStorage):
+    """rsl-rl's storage with G columns in rewards, values and returns."""
+
+    def __init__(
+        self,
+        num_envs: int,
+        num_steps: int,
+        num_groups: int,
+        obs: TensorDict,
+        num_actions: int,
+        device: str,
+    ) -> None:
+        """Allocate (T, N, ...) buffers."""
+        super().__init__("rl", num_envs, num_steps, obs, [num_actions], device)
+        shape = (num_steps, num_envs, num_groups)
+        self.rewards = torch.zeros(shape, device=device)
+        self.values = torch.zeros(shape, device=device)
+        self.returns = torch.zeros(shape, device=device)
+
+    def add_transition(self, transition: RolloutStorage.Transition) -> None:
+        """Add one step, whose rewards and values are (N, G)."""
+        if self.step >= self.num_transitions_per_env:
+            raise OverflowError("the rollout is full: clear() the storage before adding to it")
+        step = self.step
+        self.observations[step].copy_(transition.observations)
+        self.actions[step] = transition.actions
+        self.rewards[step] = transition.rewards
+        self.dones[step] = transition.dones.view(-1, 1)
+        self.values[step] = transition.values
+        self.actions_log_prob[step] = transition.actions_log_prob.view(-1, 1)
+        if self.distribution_params is None:
+            self.distribution_params = tuple(
+                torch.zeros(self.num_transitions_per_env, *p.shape, device=self.device)
+                for p in transition.distribution_params
+            )
+        for stored, new in zip(
+            self.distribution_params, transition.distribution_params, strict=True
+        ):
+            stored[step] = new
+        self.step += 1
+
+    def shuffled(self, **tensors: torch.Tensor) -> dict[str, torch.Tensor]:
+        """Flatten (T, N, ...) tensors and put them in one random order, (T * N, ...)."""
+        count = self.num_transitions_per_env * self.num_envs
+        order = torch.randperm(count, device=self.device)
+        return {name: tensor.flatten(0, 1)[order] for name, tensor in tensors.items()}
+
+
+def mini_batches(
+    data: dict[str, torch.Tensor], count: int, epochs: int
+) -> Iterator[dict[str, torch.Tensor]]:
+    """Yield `count` slices of shuffled data, `epochs` times over.
+
+    The order is drawn once: slices of a tensor shuffled once are views, and cost nothing.
+    """
+    size = len(next(iter(data.values()))) // count
+    for _ in range(epochs):
+        for i in range(count):
+            yield {name: x[i * size : (i + 1) * size] for name, x in data.items()}

@@ -1,0 +1,116 @@
+"""Checkpoints: one file that holds everything, written atomically, read without running code."""
+
+from __future__ import annotations
+
+import os
+import pickle
+import platform
+import zipfile
+from pathlib import Path
+
+import torch
+
+from kiras_rl import __version__
+from kiras_rl.models.exported import ExportedPolicy, build_policy
+
+FORMAT = 1
+FOLDER = "checkpoints"
+LATEST, BEST = "latest.pt", "best.pt"
+
+
+class CheckpointError(ValueError):
+    """A file that is no usable checkpoint: says which and why."""
+
+
+def save_checkpoint(path: Path, content: dict) -> None:
+    """Write a checkpoint; a crash at any moment leaves the old file or the new one.
+
+    Args:
+        path: Where to.
+        content: Tensors, numbers, strings, and containers of them.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        with temporary.open("wb") as file:
+            torch.save({"format": FORMAT, "versions": versions()} | content, file)
+            file.flush()
+            os.fsync(file.fileno())
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def load_checkpoint(path: Path) -> dict:
+    """Read a checkpoint onto the CPU.
+
+    Raises:
+        CheckpointError: Missing, truncated or foreign file, or another format.
+    """
+    if not path.is_file():
+        raise CheckpointError(f"no checkpoint at {path}")
+    try:
+        content = torch.load(path, map_location="cpu", weights_only=True)
+    except (pickle.UnpicklingError, RuntimeError, EOFError, OSError, zipfile.BadZipFile) as error:
+        reason = str(error).splitlines()[0][:120] if str(error) else type(error).__name__
+        raise CheckpointError(
+            f"{path} is not a whole KiRAS checkpoint ({reason}); the run's other checkpoints are "
+            f"in {path.parent}"
+        ) from None
+    if not isinstance(content, dict) or "format" not in content or "learner" not in content:
+        raise CheckpointError(f"{path} is a PyTorch file, but not a KiRAS checkpoint")
+    if content["format"] != FORMAT:
+        raise CheckpointError(
+            f"{path} has checkpoint format {content['format']}, this version reads {FORMAT}"
+        )
+    return content
+
+
+def find_checkpoint(source: Path, prefer: str = BEST) -> Path:
+    """Return the checkpoint file of a run folder, or the file itself.
+
+    Args:
+        source: runs/<cfg>/<time> or a file.
+        prefer: BEST or LATEST; the other is taken where it is missing.
+
+    Raises:
+        CheckpointError: Nothing there.
+    """
+    if source.is_file():
+        return source
+    if not source.is_dir():
+        raise CheckpointError(f"{source} does not exist: give a run folder or a checkpoint file")
+    for name in (prefer, BEST, LATEST):
+        if (source / FOLDER / name).is_file():
+            return source / FOLDER / name
+    raise CheckpointError(
+        f"{source} holds no checkpoint: expected {FOLDER}/{LATEST}, written "
+        "every few minutes by kiras-train"
+    )
+
+
+def load_policy(path: Path) -> tuple[ExportedPolicy, dict]:
+    """Rebuild the deterministic policy of a checkpoint.
+
+    Returns:
+        The policy, and its description as kiras_rl.deploy.metadata.PolicyMetadata spells it.
+
+    Raises:
+        CheckpointError: As `load_checkpoint`.
+    """
+    content = load_checkpoint(path)
+    policy = build_policy(content["policy_shape"])
+    policy.load_state_dict(content["policy"])
+    return policy.eval(), content["description"]
+
+
+def versions() -> dict[str, str]:
+    """Return the versions that a result depends on."""
+    from importlib.metadata import version
+
+    packages = ("torch", "rsl-rl-lib", "mujoco", "mujoco-warp", "numpy")
+    return {
+        "kiras-rl": __version__,
+        "python": platform.python_version(),
+        **{name: version(name) for name in packages},
+    }

@@ -1,0 +1,1 @@
+"""Onboard inference with numpy and onnxruntime only."""

@@ -1,0 +1,263 @@
+"""What a policy file says about itself: everything a robot needs besides the network."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+FORMAT = 1
+METADATA_KEY = "kiras"  # the entry of the ONNX file's metadata that holds the JSON text
+
+
+class PolicyError(ValueError):
+    """A policy file, or a reading given to a policy, that cannot be used; the message says why."""
+
+
+@dataclass(frozen=True)
+class ObservationTerm:
+    """One block of a frame: `size` numbers, each multiplied by `scale`."""
+
+    name: str
+    size: int
+    scale: float
+
+
+@dataclass(frozen=True)
+class Posture:
+    """Keyframe of a skill: base height in m, pitch (nose down positive) and joint angles in rad."""
+
+    base_height: float
+    pitch: float
+    joint_pos: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class CommandRange:
+    """Velocities that the policy was trained to follow, (lowest, highest), m/s and rad/s."""
+
+    lin_vel_x: tuple[float, float]
+    lin_vel_y: tuple[float, float]
+    ang_vel_z: tuple[float, float]
+
+
+def _term_sizes(joints: int, skills: int) -> dict[str, int]:
+    """Width of every observation term that can be rebuilt on a robot."""
+    return {
+        "projected_gravity": 3,
+        "pitch": 1,
+        "base_ang_vel": 3,
+        "command_lin_vel_x": 1,
+        "command_lin_vel_y": 1,
+        "command_ang_vel_z": 1,
+        "skill": skills,
+        "joint_pos": joints,
+        "joint_vel": joints,
+        "last_action": joints,
+    }
+
+
+@dataclass(frozen=True)
+class PolicyMetadata:
+    """Robot, observation, action and skills of one policy.
+
+    Joint quantities follow `joint_names`: angles in rad, gains in N m/rad and N m s/rad, torques
+    in N m.
+    A joint target is `default_joint_pos + action_scale * clip(action, -action_clip, action_clip)`.
+    `history_length` counts the past frames, without the current one; `control_rate` is in Hz.
+    `provenance` is free: what made the file, for people to read.
+
+    Raises:
+        PolicyError: If the parts do not fit each other.
+    """
+
+    robot: str
+    joint_names: tuple[str, ...]
+    default_joint_pos: tuple[float, ...]
+    kp: tuple[float, ...]
+    kd: tuple[float, ...]
+    torque_limit: tuple[float, ...]
+    action_scale: tuple[float, ...]
+    action_clip: float
+    observation: tuple[ObservationTerm, ...]
+    history_length: int
+    skills: tuple[str, ...]
+    keyframes: dict[str, Posture]
+    control_rate: float
+    command_range: CommandRange
+    version: str
+    provenance: dict[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        """Check lengths, names and signs, so that nothing later has to."""
+        self._check_joints()
+        self._check_skills()
+        self._check_observation()
+        for name in ("action_clip", "history_length", "control_rate"):
+            _require(getattr(self, name) > 0, f"{name} must be positive, not {getattr(self, name)}")
+
+    @property
+    def num_joints(self) -> int:
+        """Number of joints, J."""
+        return len(self.joint_names)
+
+    @property
+    def frame_size(self) -> int:
+        """Width of one frame, P."""
+        return sum(term.size for term in self.observation)
+
+    @property
+    def history_size(self) -> int:
+        """Width of the flattened history, H*P."""
+        return self.history_length * self.frame_size
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain dicts, tuples and numbers, with the format number."""
+        return {"format": FORMAT, **asdict(self)}
+
+    def to_json(self) -> str:
+        """Return the JSON text that travels in the policy file."""
+        return json.dumps(self.to_dict(), default=str)  # provenance may hold anything
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> PolicyMetadata:
+        """Build from plain data, which may be what JSON or a checkpoint gave back.
+
+        Keys that this version does not know are left out.
+
+        Raises:
+            PolicyError: If the format is another one, or a value is missing or does not fit.
+        """
+        given = data.get("format")
+        _require(
+            given == FORMAT,
+            f"format {given} was given, and this version of kiras-rl reads format {FORMAT}: "
+            "export the policy again, or install the version that wrote it",
+        )
+        missing = [name for name in _READERS if name not in data]
+        _require(not missing, f"missing: {', '.join(missing)}")
+        return cls(**{name: _read(name, reader, data[name]) for name, reader in _READERS.items()})
+
+    @classmethod
+    def from_json(cls, text: str) -> PolicyMetadata:
+        """Parse the JSON text of a policy file.
+
+        Raises:
+            PolicyError: If the text is not a description of a policy.
+        """
+        try:
+            data = json.loads(text)
+        except json.JSONDecodeError as error:
+            raise PolicyError(f"policy metadata: not valid JSON ({error})") from None
+        _require(isinstance(data, dict), "not a JSON object")
+        return cls.from_dict(data)
+
+    def _check_joints(self) -> None:
+        for name in ("default_joint_pos", "kp", "kd", "torque_limit", "action_scale"):
+            count = len(getattr(self, name))
+            _require(
+                count == self.num_joints,
+                f"{name} holds {count} numbers for {self.num_joints} joints",
+            )
+        _require(all(scale > 0 for scale in self.action_scale), "action_scale must be positive")
+
+    def _check_skills(self) -> None:
+        _require(len(self.skills) > 0, "no skills")
+        without = [skill for skill in self.skills if skill not in self.keyframes]
+        _require(not without, f"no keyframe for the skills {', '.join(without)}")
+        for skill, posture in self.keyframes.items():
+            count = len(posture.joint_pos)
+            _require(
+                count == self.num_joints,
+                f"keyframe {skill} holds {count} angles for {self.num_joints} joints",
+            )
+
+    def _check_observation(self) -> None:
+        sizes = _term_sizes(self.num_joints, len(self.skills))
+        _require(len(self.observation) > 0, "no observation terms")
+        for term in self.observation:
+            _require(
+                term.name in sizes,
+                f"unknown observation term '{term.name}'; known: {', '.join(sizes)}",
+            )
+            _require(
+                term.size == sizes[term.name],
+                f"observation term '{term.name}' has size {term.size}, expected {sizes[term.name]}",
+            )
+
+
+def _require(condition: bool, message: str) -> None:
+    if not condition:
+        raise PolicyError(f"policy metadata: {message}")
+
+
+def _read(name: str, reader: Callable[[Any], Any], value: Any) -> Any:
+    try:
+        return reader(value)
+    except PolicyError:
+        raise
+    except (TypeError, ValueError, KeyError, AttributeError) as error:
+        raise PolicyError(f"policy metadata: {name} cannot be read ({error!r})") from None
+
+
+def _number(value: Any) -> float:
+    number = float(value)
+    if not math.isfinite(number):
+        raise ValueError(f"{number} is not finite")
+    return number
+
+
+def _numbers(values: Sequence[Any]) -> tuple[float, ...]:
+    return tuple(_number(value) for value in values)
+
+
+def _names(values: Sequence[Any]) -> tuple[str, ...]:
+    return tuple(str(value) for value in values)
+
+
+def _terms(values: Sequence[Mapping[str, Any]]) -> tuple[ObservationTerm, ...]:
+    return tuple(
+        ObservationTerm(str(term["name"]), int(term["size"]), _number(term["scale"]))
+        for term in values
+    )
+
+
+def _postures(values: Mapping[str, Mapping[str, Any]]) -> dict[str, Posture]:
+    return {
+        str(skill): Posture(
+            _number(value["base_height"]), _number(value["pitch"]), _numbers(value["joint_pos"])
+        )
+        for skill, value in values.items()
+    }
+
+
+def _interval(values: Sequence[Any]) -> tuple[float, float]:
+    low, high = _numbers(values)
+    return low, high
+
+
+def _command_range(values: Mapping[str, Any]) -> CommandRange:
+    axes = ("lin_vel_x", "lin_vel_y", "ang_vel_z")
+    return CommandRange(**{axis: _interval(values[axis]) for axis in axes})
+
+
+_READERS: dict[str, Callable[[Any], Any]] = {
+    "robot": str,
+    "joint_names": _names,
+    "default_joint_pos": _numbers,
+    "kp": _numbers,
+    "kd": _numbers,
+    "torque_limit": _numbers,
+    "action_scale": _numbers,
+    "action_clip": _number,
+    "observation": _terms,
+    "history_length": int,
+    "skills": _names,
+    "keyframes": _postures,
+    "control_rate": _number,
+    "command_range": _command_range,
+    "version": str,
+    "provenance": dict,
+}

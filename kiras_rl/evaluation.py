@@ -1,0 +1,193 @@
+"""Deterministic evaluation: noisy rollouts look like gaits that vanish with the noise."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+
+import torch
+from tensordict import TensorDict
+
+from kiras_rl.interfaces import SkillEnv
+
+SETTLE = 1.0  # s that are not counted
+AVERAGE = 0.4  # s of the moving average of height and pitch: about two strides
+SEED = 12345  # every evaluation draws the same robots
+
+Policy = Callable[[TensorDict], torch.Tensor]
+
+
+@dataclass(frozen=True)
+class SkillResult:
+    """One skill, averaged over its robots and the time after the first second.
+
+    Attributes:
+        height: Mean base height, m.
+        pitch: Mean pitch, rad.
+        velocity: Mean v_x in the heading frame, m/s.
+        height_error: Mean |height - keyframe| of the moving average, m.
+        pitch_error: Mean |pitch - keyframe| of the moving average, rad.
+        velocity_error: Mean |v_x - command|, at each step, m/s.
+        lifts: Lifts a second of the foot that lifts least.
+        distinct: Share of robots whose mean height and pitch are nearest their own keyframe.
+        falls: Share of robots that fell.
+    """
+
+    height: float
+    pitch: float
+    velocity: float
+    height_error: float
+    pitch_error: float
+    velocity_error: float
+    lifts: float
+    distinct: float
+    falls: float
+
+    def meets(self, height: float, pitch: float, velocity: float, falls: float) -> bool:
+        """Return whether errors (m, rad, m/s) and falls stay within limits and the robot steps."""
+        return (
+            self.height_error <= height
+            and self.pitch_error <= pitch
+            and self.velocity_error <= velocity
+            and self.falls <= falls
+            and self.lifts >= 1.0
+        )
+
+
+@dataclass(frozen=True)
+class Recording:
+    """What N robots did in T steps; see Measurements for frames and units."""
+
+    skill: torch.Tensor  # (N,)
+    command: torch.Tensor  # (N, 3)
+    height: torch.Tensor  # (T, N)
+    pitch: torch.Tensor  # (T, N)
+    velocity: torch.Tensor  # (T, N)
+    contact: torch.Tensor  # (T, N, F)
+    alive: torch.Tensor  # (T, N): not fallen up to and including this step
+    step_dt: float
+
+
+def evaluate_skills(
+    env: SkillEnv, policy: Policy, duration: float, command: float
+) -> dict[str, SkillResult]:
+    """Walk every skill straight ahead from its own keyframe.
+
+    Args:
+        env: Worlds are dealt to the skills in turn.
+        policy: Observation -> mean actions.
+        duration: Of each trial, s.
+        command: v_x, m/s.
+    """
+    skill = torch.arange(env.num_envs, device=env.device) % len(env.skills)
+    commands = torch.zeros(env.num_envs, 3, device=env.device)
+    commands[:, 0] = command
+    recording = record(env, policy, duration, skill, commands)
+    return summarize(recording, env)
+
+
+@torch.no_grad()
+def record(
+    env: SkillEnv, policy: Policy, duration: float, skill: torch.Tensor, command: torch.Tensor
+) -> Recording:
+    """Run the policy from the keyframes of `skill` (N,) with constant commands (N, 3)."""
+    env.seed(SEED)
+    obs = env.reset(skill, command)
+    alive = torch.ones(env.num_envs, dtype=torch.bool, device=env.device)
+    steps = []
+    for _ in range(round(duration / env.step_dt)):
+        obs = env.step(policy(obs))[0]
+        now = env.measure()
+        alive = alive & ~now.fallen
+        steps.append((now.base_height, now.pitch, now.lin_vel_h[:, 0], now.foot_contact, alive))
+    height, pitch, velocity, contact, alive_at = (torch.stack(x) for x in zip(*steps, strict=True))
+    return Recording(skill, command, height, pitch, velocity, contact, alive_at, env.step_dt)
+
+
+def summarize(recording: Recording, env: SkillEnv) -> dict[str, SkillResult]:
+    """Reduce a recording to one result a skill; a robot counts until it falls."""
+    target_height = env.keyframe_height[recording.skill]
+    target_pitch = env.keyframe_pitch[recording.skill]
+    start = round(SETTLE / recording.step_dt)
+    alive = recording.alive[start:].float()
+    height = moving_average(recording.height, recording.step_dt)[start:]
+    pitch = moving_average(recording.pitch, recording.step_dt)[start:]
+    velocity = recording.velocity[start:]
+    per_robot = {
+        "height": _mean(recording.height[start:], alive),
+        "pitch": _mean(recording.pitch[start:], alive),
+        "velocity": _mean(velocity, alive),
+        "height_error": _mean((height - target_height).abs(), alive),
+        "pitch_error": _mean((pitch - target_pitch).abs(), alive),
+        "velocity_error": _mean((velocity - recording.command[:, 0]).abs(), alive),
+        "lifts": lifts_per_second(recording.contact[start:], recording.step_dt),
+        "falls": 1.0 - recording.alive[-1].float(),
+    }
+    per_robot["distinct"] = _distinct(per_robot["height"], per_robot["pitch"], recording, env)
+    results = {}
+    for index, name in enumerate(env.skills):
+        mine = recording.skill == index
+        values = {key: value[mine].mean().item() for key, value in per_robot.items()}
+        results[name] = SkillResult(**values)
+    return results
+
+
+def moving_average(signal: torch.Tensor, step_dt: float) -> torch.Tensor:
+    """Average each step of (T, N) with the AVERAGE seconds before it."""
+    width = round(AVERAGE / step_dt)
+    padded = torch.cat([signal[:1].expand(width - 1, -1), signal])
+    return padded.unfold(0, width, 1).mean(dim=-1)
+
+
+def lifts_per_second(contact: torch.Tensor, step_dt: float) -> torch.Tensor:
+    """Return how often the least lifted foot of each robot leaves the ground, (N,), 1/s.
+
+    Args:
+        contact: (T, N, F) bool.
+        step_dt: s.
+    """
+    lifted = contact[:-1] & ~contact[1:]
+    return lifted.float().sum(dim=0).amin(dim=-1) / (len(contact) * step_dt)
+
+
+def score(results: dict[str, SkillResult]) -> float:
+    """Return one number for "how good is this policy": lower is better, 0 is perfect.
+
+    Errors are measured against the limits that make skills useful (3 cm, 5 degrees, 0.12 m/s); a
+    fall or a skill that does not step costs as much as an error at its limit.
+    """
+    parts = [
+        r.height_error / 0.03
+        + r.pitch_error / 0.087
+        + r.velocity_error / 0.12
+        + max(0.0, 1.0 - r.lifts)
+        + 2.0 * r.falls
+        for r in results.values()
+    ]
+    return sum(parts) / len(parts)
+
+
+def as_scalars(results: dict[str, SkillResult]) -> dict[str, float]:
+    """Return the results by log name, Eval_<skill>/<quantity>."""
+    scalars = {"Eval/score": score(results)}
+    for skill, result in results.items():
+        scalars |= {f"Eval_{skill}/{key}": value for key, value in asdict(result).items()}
+    return scalars
+
+
+def _mean(signal: torch.Tensor, alive: torch.Tensor) -> torch.Tensor:
+    """Average (T, N) over the steps before a fall; 0 steps give the value at the start."""
+    count = alive.sum(dim=0)
+    mean = torch.where(alive > 0, signal, 0.0).sum(dim=0) / count.clamp(min=1.0)
+    return torch.where(count > 0, mean, signal[0])
+
+
+def _distinct(
+    height: torch.Tensor, pitch: torch.Tensor, recording: Recording, env: SkillEnv
+) -> torch.Tensor:
+    """Return whether the nearest keyframe (1 cm counts as 1.5 degrees) is the robot's own."""
+    weight = 0.01 / 0.026
+    distance = (height[:, None] - env.keyframe_height).square() + (
+        weight * (pitch[:, None] - env.keyframe_pitch)
+    ).square()
+    return (distance.argmin(dim=1) == recording.skill).float()

@@ -1,0 +1,1 @@
+"""Self-imitation: the premium trajectory selector."""

@@ -1,0 +1,176 @@
+"""Self-imitation learning: the discriminator, its reward and the premium trajectories."""
+
+from __future__ import annotations
+
+import torch
+from tensordict import TensorDict
+
+from kiras_rl import interfaces as names
+from kiras_rl.algorithms.losses import discriminator_loss
+from kiras_rl.algorithms.storage import GroupRolloutStorage
+from kiras_rl.config import ImitationConfig
+from kiras_rl.imitation.premium import PremiumSelector
+from kiras_rl.interfaces import SkillEnv
+from kiras_rl.models.discriminator import Discriminator, imitation_reward
+from kiras_rl.schedules import piecewise_linear
+
+
+class SelfImitation:
+    """What the learner owns to imitate keyframes and its own best motions.
+
+    Letters: T steps, N worlds, B pairs of a batch, D features, S skills.
+    """
+
+    def __init__(
+        self,
+        config: ImitationConfig,
+        keyframe_features: torch.Tensor,
+        feature_noise: torch.Tensor,
+        skills: tuple[str, ...],
+        num_envs: int,
+        num_steps: int,
+    ) -> None:
+        """Build discriminator, optimizer, selector and the rollout's pairs.
+
+        Args:
+            config: See cfg/base.yaml.
+            keyframe_features: Phi of each keyframe, (S, D).
+            feature_noise: Standard deviation of one unit of instance noise, (D,).
+            skills: Names, for the log.
+            num_envs: N.
+            num_steps: T.
+        """
+        device = keyframe_features.device
+        features = keyframe_features.shape[1]
+        self.config = config
+        self._skills = skills
+        self._noise = feature_noise.repeat(2)
+        self.discriminator = Discriminator(features, config.discriminator.hidden_dims).to(device)
+        self.optimizer = torch.optim.Adam(
+            self.discriminator.parameters(), lr=config.discriminator.learning_rate, fused=True
+        )
+        self.selector = PremiumSelector(config.premium, keyframe_features, num_envs, num_steps)
+        self._pairs = torch.zeros(num_steps, num_envs, 2 * features, device=device)
+        self._valid = torch.zeros(num_steps, num_envs, dtype=torch.bool, device=device)
+        self._rewards = torch.zeros(num_steps, num_envs, device=device)
+        self._step = 0
+
+    @classmethod
+    def build(
+        cls,
+        config: ImitationConfig | None,
+        obs: TensorDict,
+        env: SkillEnv,
+        num_steps: int,
+        device: str,
+    ) -> SelfImitation | None:
+        """Build for an environment, or return None where the configuration has no imitation."""
+        if config is None:
+            return None
+        return cls(
+            config,
+            env.keyframe_features.to(device),
+            env.feature_noise.to(device),
+            env.skills,
+            len(obs),
+            num_steps,
+        )
+
+    def record(
+        self, before: TensorDict, rewards: torch.Tensor, dones: torch.Tensor, extras: dict
+    ) -> torch.Tensor:
+        """Store a step and return its imitation reward, (N,).
+
+        Both halves of a pair come from one episode: the second is Phi before the reset.
+        """
+        after, valid = extras[names.EXTRA_IMITATION], extras[names.EXTRA_VALID]
+        pair = torch.cat([before[names.IMITATION], after], dim=-1)
+        reward = self.config.reward_weight * imitation_reward(self.discriminator(pair)) * valid
+        self._pairs[self._step], self._valid[self._step] = pair, valid
+        self._rewards[self._step] = reward
+        self._step += 1
+        failed = dones.bool() & ~extras[names.EXTRA_TIME_OUTS]
+        self.selector.record(
+            features=after,
+            skill=before[names.SKILL].argmax(dim=-1),
+            reward=rewards,
+            speed=torch.linalg.vector_norm(before[names.COMMAND][:, :2], dim=-1),
+            done=dones.bool(),
+            valid=valid & ~failed,
+        )
+        return reward
+
+    def update(
+        self, storage: GroupRolloutStorage, iteration: int, progress: float
+    ) -> dict[str, float]:
+        """Renew the premium buffer, train the discriminator; return scalars for the log."""
+        one_hot = storage.observations[names.SKILL]
+        scalars = self._describe(one_hot)
+        self.selector.select(iteration)
+        pairs, valid = self._pairs.flatten(0, 1), self._valid.flatten()
+        skill = one_hot.flatten(0, 1).argmax(dim=-1)
+        noise = piecewise_linear(self.config.discriminator.noise, progress)
+        for _ in range(self.config.discriminator.updates):
+            loss, expert, policy = self._train_step(pairs, valid, skill, noise)
+        self._step = 0
+        scalars |= {
+            "Discriminator/loss": loss.item(),
+            "Discriminator/expert": expert.mean().item(),
+            "Discriminator/policy": policy.mean().item(),
+        }
+        return scalars | self._describe_buffer(iteration)
+
+    def _train_step(
+        self, pairs: torch.Tensor, valid: torch.Tensor, skill: torch.Tensor, noise: float
+    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Take one step on a batch; experts show the same skills as the policy's pairs.
+
+        Other proportions would reward a skill for being frequent: its code is an input.
+        """
+        size = self.config.discriminator.batch_size
+        drawn = torch.randint(len(pairs), (size,), device=pairs.device)
+        expert = self.selector.sample(skill[drawn])
+        both = torch.cat([expert, pairs[drawn]])
+        scores = self.discriminator(both + noise * self._noise * torch.randn_like(both))
+        expert_score, policy_score = scores.chunk(2)
+        loss = discriminator_loss(expert_score, policy_score, valid[drawn])
+        self.optimizer.zero_grad()
+        loss.backward()
+        self.optimizer.step()
+        return loss.detach(), expert_score.detach(), policy_score.detach()
+
+    def _describe(self, one_hot: torch.Tensor) -> dict[str, float]:
+        """Return the mean imitation reward of each skill over the rollout."""
+        count = one_hot.sum(dim=(0, 1)).clamp(min=1.0)
+        means = (self._rewards.unsqueeze(-1) * one_hot).sum(dim=(0, 1)) / count
+        return _by_skill("Imitation/reward", self._skills, means)
+
+    def _describe_buffer(self, iteration: int) -> dict[str, float]:
+        selector = self.selector
+        known = selector.scores.isfinite()
+        count = selector.counts
+        age = ((iteration - selector.born) * known).sum(dim=1) / count.clamp(min=1)
+        best = torch.where(count > 0, selector.scores[:, 0], 0.0)
+        return {
+            **_by_skill("Premium/best_score", self._skills, best),
+            **_by_skill("Premium/age", self._skills, age),
+            **_by_skill("Premium/count", self._skills, count),
+        }
+
+    def state_dict(self) -> dict:
+        """Return networks, optimizer and buffers."""
+        return {
+            "discriminator": self.discriminator.state_dict(),
+            "optimizer": self.optimizer.state_dict(),
+            "selector": self.selector.state_dict(),
+        }
+
+    def load_state_dict(self, state: dict) -> None:
+        """Go on from a saved state."""
+        self.discriminator.load_state_dict(state["discriminator"])
+        self.optimizer.load_state_dict(state["optimizer"])
+        self.selector.load_state_dict(state["selector"])
+
+
+def _by_skill(tag: str, skills: tuple[str, ...], values: torch.Tensor) -> dict[str, float]:
+    return {f"{tag}_{name}": value for name, value in zip(skills, values.tolist(), strict=True)}

@@ -1,0 +1,1 @@
+"""Networks beside the actor and the critics: context estimator, discriminator, exported policy."""

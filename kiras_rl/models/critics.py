@@ -1,0 +1,41 @@
+"""One critic a reward group behind the interface of one critic."""
+
+from __future__ import annotations
+
+import torch
+from rsl_rl.models import MLPModel
+from tensordict import TensorDict
+from torch import nn
+
+
+class GroupCritic(nn.Module):
+    """G independent value networks; group 0 is the task, group 1 imitation."""
+
+    is_recurrent = False
+
+    def __init__(
+        self,
+        obs: TensorDict,
+        obs_groups: dict[str, list[str]],
+        num_groups: int,
+        hidden_dims: list[int],
+    ) -> None:
+        """Build G networks on the observation set "critic"."""
+        super().__init__()
+        self.critics = nn.ModuleList(
+            MLPModel(obs, obs_groups, "critic", 1, hidden_dims, "elu") for _ in range(num_groups)
+        )
+
+    def forward(self, obs: TensorDict, **_: object) -> torch.Tensor:
+        """Return the values of every group, (N, G)."""
+        return torch.cat([critic(obs) for critic in self.critics], dim=-1)
+
+    def reset(self, dones: torch.Tensor | None = None, hidden_state: object = None) -> None:
+        """Do nothing: there is no memory."""
+
+    def get_hidden_state(self) -> None:
+        """Return None: there is no memory."""
+        return None
+
+    def update_normalization(self, obs: TensorDict) -> None:
+        """Do nothing: observations have fixed scales."""

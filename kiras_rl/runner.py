@@ -1,0 +1,347 @@
+"""The runner: rollouts and updates, evaluation, logging, checkpoints that resume exactly."""
+
+from __future__ import annotations
+
+import signal
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from rsl_rl.runners import OnPolicyRunner
+from rsl_rl.utils import check_nan
+from torch.utils.tensorboard import SummaryWriter
+
+from kiras_rl import __version__, checkpoint
+from kiras_rl.algorithms.kiras import KirasPPO
+from kiras_rl.config import Config, config_to_dict
+from kiras_rl.deploy.metadata import FORMAT as METADATA_FORMAT
+from kiras_rl.evaluation import Policy, SkillResult, as_scalars, score
+from kiras_rl.interfaces import SkillEnv
+
+Evaluate = Callable[[Policy], dict[str, SkillResult]]
+
+
+@dataclass
+class Status:
+    """What a progress line shows after an iteration.
+
+    Attributes:
+        iteration: Iterations done.
+        iterations: Iterations in all.
+        steps: Environment steps done.
+        seconds: Wall time of this iteration.
+        scalars: Everything that was logged for it.
+        evaluation: The latest deterministic evaluation, empty before the first.
+    """
+
+    iteration: int
+    iterations: int
+    steps: int
+    seconds: float
+    scalars: dict[str, float]
+    evaluation: dict[str, SkillResult]
+
+
+class KirasRunner(OnPolicyRunner):
+    """rsl-rl's runner with a phase clock, self-contained checkpoints and one log per rollout."""
+
+    alg: KirasPPO
+    env: SkillEnv
+
+    def __init__(
+        self,
+        env: SkillEnv,
+        config: Config,
+        run_dir: Path | None,
+        device: str,
+        evaluate: Evaluate | None = None,
+        commit: str = "unknown",
+    ) -> None:
+        """Build the learner.
+
+        Args:
+            env: The training environment.
+            config: The run.
+            run_dir: Folder of the run; None writes nothing.
+            device: Of the networks.
+            evaluate: Judges a policy without action noise; called every evaluation.interval.
+            commit: Of the source, for the provenance of the policy.
+        """
+        torch.manual_seed(config.seed)
+        self.config, self.run_dir = config, run_dir
+        super().__init__(env, _rsl_rl_config(config), log_dir=None, device=device)
+        self.evaluate, self.commit = evaluate, commit
+        self.evaluation: dict[str, SkillResult] = {}
+        self.best_score = float("inf")
+        self.seconds = 0.0  # of training, over all resumes
+        self._writer: SummaryWriter | None = None
+        self._last_saved = time.monotonic()
+
+    # --- the loop -------------------------------------------------------------------------------
+
+    def learn(
+        self,
+        num_learning_iterations: int | None = None,
+        init_at_random_ep_len: bool = False,
+        on_iteration: Callable[[Status], None] | None = None,
+    ) -> bool:
+        """Train until `iterations` are done or the process is asked to stop.
+
+        SIGINT and SIGTERM let the iteration end, save, and return.
+
+        Args:
+            num_learning_iterations: At most this many now; None for all that remain.
+            init_at_random_ep_len: Must be False: the environment spreads its episodes itself.
+            on_iteration: Called after each iteration.
+
+        Returns:
+            Whether all iterations are done.
+        """
+        if init_at_random_ep_len:
+            raise ValueError("set env.terminations.random_first_length instead")
+        total = self.config.iterations
+        last = total
+        if num_learning_iterations is not None:
+            last = min(total, self.current_learning_iteration + num_learning_iterations)
+        self._open_log()
+        with StopRequest() as stop:
+            while self.current_learning_iteration < last and not stop.requested:
+                status = self._iterate()
+                if on_iteration:
+                    on_iteration(status)
+                if time.monotonic() - self._last_saved > 60.0 * self.config.checkpoint_minutes:
+                    self.save_latest()
+            self.save_latest()
+        self._close_log()
+        return self.current_learning_iteration >= total
+
+    def _iterate(self) -> Status:
+        begin = time.perf_counter()
+        log = self._rollout()
+        collected = time.perf_counter()
+        scalars = self.alg.update()
+        self._renew_skill_probabilities(scalars)
+        learned = time.perf_counter()
+        self.current_learning_iteration += 1
+        steps = self.env.num_envs * self.cfg["num_steps_per_env"]
+        physics = log.pop("Perf/physics_time")
+        scalars |= {key: value.item() for key, value in log.items()} | {
+            "Perf/physics_time": physics.item(),
+            "Perf/environment_time": self._env_time - physics.item(),
+            "Perf/inference_time": collected - begin - self._env_time,
+            "Perf/learning_time": learned - collected,
+            "Perf/steps_per_second": steps / (learned - begin),
+        }
+        scalars |= self._evaluate_when_due()
+        seconds = time.perf_counter() - begin
+        self.seconds += seconds
+        self._write(scalars)
+        return Status(
+            iteration=self.current_learning_iteration,
+            iterations=self.config.iterations,
+            steps=steps * self.current_learning_iteration,
+            seconds=seconds,
+            scalars=scalars,
+            evaluation=self.evaluation,
+        )
+
+    def _rollout(self) -> dict[str, torch.Tensor]:
+        """Collect one rollout; return the environment's log, averaged over its steps."""
+        totals: dict[str, torch.Tensor] = {}
+        num_steps = self.cfg["num_steps_per_env"]
+        self._env_time = 0.0
+        obs = self.env.get_observations()
+        # no_grad, not inference_mode: what is recorded here is trained on, and edited, later
+        with torch.no_grad(), single_threaded(self.device):
+            for _ in range(num_steps):
+                actions = self.alg.act(obs)
+                begin = time.perf_counter()
+                obs, rewards, dones, extras = self.env.step(actions)
+                self._env_time += time.perf_counter() - begin
+                self.alg.process_env_step(obs, rewards, dones, extras)
+                for key, value in extras["log"].items():
+                    totals[key] = totals[key] + value if key in totals else value
+            # Once a rollout: every check waits for the device. NaN in an earlier step is still
+            # there, in the history of observations or in the stored rewards.
+            check_nan(obs, self.alg.storage.rewards, self.alg.storage.dones)
+            self.alg.compute_returns(obs)
+        counts = ("Episode/", "Sim/", "Perf/")
+        return {k: v if k.startswith(counts) else v / num_steps for k, v in totals.items()}
+
+    def _renew_skill_probabilities(self, scalars: dict[str, float]) -> None:
+        probabilities = self.alg.skill_probabilities(self.env.keyframe_observations())
+        if probabilities is None:
+            return
+        self.env.set_skill_probabilities(probabilities)
+        for name, value in zip(self.env.skills, probabilities.tolist(), strict=True):
+            scalars[f"Skill/probability_{name}"] = value
+
+    def _evaluate_when_due(self) -> dict[str, float]:
+        interval, done = self.config.evaluation.interval, self.current_learning_iteration
+        is_due = interval and (done % interval == 0 or done == self.config.iterations)
+        if not self.evaluate or not is_due:
+            return {}
+        begin = time.perf_counter()
+        with single_threaded(self.device):
+            self.evaluation = self.evaluate(self.alg.act_deterministic)
+        scalars = as_scalars(self.evaluation) | {
+            "Perf/evaluation_time": time.perf_counter() - begin
+        }
+        if score(self.evaluation) < self.best_score:
+            self.best_score = score(self.evaluation)
+            self._save_as(checkpoint.BEST)
+        return scalars
+
+    # --- log ------------------------------------------------------------------------------------
+
+    def _open_log(self) -> None:
+        if self.run_dir is not None:
+            # purge_step: after a resume, points that a lost stretch had written disappear
+            self._writer = SummaryWriter(
+                str(self.run_dir), purge_step=self.current_learning_iteration + 1, flush_secs=10
+            )
+
+    def _write(self, scalars: dict[str, float]) -> None:
+        if self._writer is not None:
+            for key, value in scalars.items():
+                self._writer.add_scalar(key, value, self.current_learning_iteration)
+
+    def _close_log(self) -> None:
+        if self._writer is not None:
+            self._writer.close()
+            self._writer = None
+
+    # --- checkpoints ----------------------------------------------------------------------------
+
+    def save_latest(self) -> None:
+        """Write the latest checkpoint of the run."""
+        self._save_as(checkpoint.LATEST)
+        self._last_saved = time.monotonic()
+
+    def _save_as(self, name: str) -> None:
+        if self.run_dir is not None:
+            self.save(str(self.run_dir / checkpoint.FOLDER / name))
+
+    def save(self, path: str, infos: dict | None = None) -> None:
+        """Write everything that training depends on to `path`."""
+        policy = self.alg.policy()
+        content = {
+            "config": config_to_dict(self.config),
+            "skills": list(self.env.skills),
+            "iteration": self.current_learning_iteration,
+            "seconds": self.seconds,
+            "best_score": self.best_score,
+            "learner": self.alg.save(),
+            "env": self.env.state_dict(),
+            "generators": _generator_states(),
+            "policy": policy.state_dict(),
+            "policy_shape": policy.shape(),
+            "description": self._describe_policy(),
+            "infos": infos,
+        }
+        checkpoint.save_checkpoint(Path(path), content)
+
+    def _describe_policy(self) -> dict:
+        """Return the policy's metadata with where it comes from."""
+        steps = self.env.num_envs * self.cfg["num_steps_per_env"] * self.current_learning_iteration
+        provenance = {
+            "iterations": self.current_learning_iteration,
+            "steps": steps,
+            "minutes": round(self.seconds / 60, 1),
+            "commit": self.commit,
+            "versions": checkpoint.versions(),
+            "config": config_to_dict(self.config),
+        }
+        header = {"format": METADATA_FORMAT, "version": __version__, "provenance": provenance}
+        return header | self.env.describe()
+
+    def load(
+        self,
+        path: str,
+        load_cfg: dict | None = None,
+        strict: bool = True,
+        map_location: str | None = None,
+    ) -> dict | None:
+        """Go on exactly from a checkpoint.
+
+        Raises:
+            CheckpointError: Unusable file, or one of other skills.
+        """
+        content = checkpoint.load_checkpoint(Path(path))
+        if content["skills"] != list(self.env.skills):
+            raise checkpoint.CheckpointError(
+                f"{path} was trained on the skills {', '.join(content['skills'])}; the robot has "
+                f"{', '.join(self.env.skills)}: mend its keyframes.yaml or start a new run"
+            )
+        self.alg.load(content["learner"], load_cfg, strict)
+        self.env.load_state_dict(content["env"])
+        self.current_learning_iteration = content["iteration"]
+        self.seconds, self.best_score = content["seconds"], content["best_score"]
+        _set_generator_states(content["generators"])
+        return content["infos"]
+
+
+class StopRequest:
+    """Turns SIGINT and SIGTERM into a flag while the context is open."""
+
+    def __enter__(self) -> StopRequest:
+        """Install the handlers; outside the main thread there are none to install."""
+        self.requested = False
+        self._old = {}
+        with suppress(ValueError):
+            for number in (signal.SIGINT, signal.SIGTERM):
+                self._old[number] = signal.signal(number, self._request)
+        return self
+
+    def _request(self, number: int, frame: object) -> None:
+        self.requested = True
+        signal.signal(number, self._old[number])  # a second one acts at once
+
+    def __exit__(self, *_: object) -> None:
+        """Restore the handlers."""
+        for number, handler in self._old.items():
+            signal.signal(number, handler)
+
+
+class single_threaded:  # noqa: N801  (used like a function)
+    """Keeps torch to one thread on a CPU: OpenMP's waiting threads would starve the physics."""
+
+    def __init__(self, device: str) -> None:
+        """Do nothing on a GPU."""
+        self._threads = torch.get_num_threads() if torch.device(device).type == "cpu" else None
+
+    def __enter__(self) -> None:
+        """Leave one thread."""
+        if self._threads is not None:
+            torch.set_num_threads(1)
+
+    def __exit__(self, *_: object) -> None:
+        """Give the threads back."""
+        if self._threads is not None:
+            torch.set_num_threads(self._threads)
+
+
+def _rsl_rl_config(config: Config) -> dict:
+    return {
+        "algorithm": {"class_name": "kiras_rl.algorithms.kiras.KirasPPO"},
+        "learner": config.learner,
+        "iterations": config.iterations,
+        "num_steps_per_env": config.learner.ppo.num_steps,
+        "save_interval": 0,
+    }
+
+
+def _generator_states() -> dict[str, torch.Tensor]:
+    states = {"cpu": torch.get_rng_state()}
+    if torch.cuda.is_available():
+        states["cuda"] = torch.cuda.get_rng_state()
+    return states
+
+
+def _set_generator_states(states: dict[str, torch.Tensor]) -> None:
+    torch.set_rng_state(states["cpu"])
+    if "cuda" in states and torch.cuda.is_available():
+        torch.cuda.set_rng_state(states["cuda"])

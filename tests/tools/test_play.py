@@ -1,0 +1,149 @@
+"""kiras-play: a table, a picture, and one line for everything that cannot be."""
+
+from __future__ import annotations
+
+import sys
+
+import matplotlib.image
+import numpy as np
+import pytest
+
+from kiras_rl.robots.robot import load_robot
+from kiras_rl.tools import policies, rendering
+from kiras_rl.tools.play import main
+
+SHORT = "--script=walk:0.4:0.3,crawl:0.4:0.3"
+
+
+def test_without_pictures_it_prints_a_table_of_every_skill(still_file, capsys):
+    assert main([str(still_file)]) == 0
+    out = capsys.readouterr().out
+    assert "solo8, 21 s" in out
+    for skill in load_robot("solo8").skills:
+        assert skill in out
+
+
+def test_a_trace_is_drawn(still_file, tmp_path, capsys):
+    path = tmp_path / "new" / "trace.png"
+    assert main([str(still_file), SHORT, "--trace", str(path)]) == 0
+    picture = matplotlib.image.imread(path)[:, :, :3]
+    assert min(picture.shape[:2]) > 600
+    for part in np.array_split(picture, 5):  # about one panel each
+        assert len(np.unique(part.reshape(-1, 3), axis=0)) > 20
+    assert capsys.readouterr().out == f"wrote {path}\n"
+
+
+def test_a_trace_is_saved_as_arrays(still_file, tmp_path):
+    assert main([str(still_file), SHORT, "--trace", str(tmp_path / "trace.npz")]) == 0
+    assert np.load(tmp_path / "trace.npz")["base_height"].shape == (40,)
+
+
+def test_a_strip_of_pictures_is_drawn(still_file, tmp_path):
+    try:
+        rendering.choose_backend()
+    except rendering.RenderError as error:
+        pytest.skip(str(error))
+    path = tmp_path / "strip.png"
+    assert main([str(still_file), "--script=walk:0.1:0.3", "--frames", str(path)]) == 0
+    picture = matplotlib.image.imread(path)
+    assert picture.shape[1] > 8 * 290  # eight pictures of 300 pixels in one row
+    assert picture[:, :, :3].std() > 0.05
+
+
+def test_the_policy_that_comes_with_a_robot_is_taken(monkeypatch, still_file, tmp_path, capsys):
+    monkeypatch.setattr(policies, "shipped_policy", lambda robot: still_file)
+    assert main([SHORT]) == 0
+    assert "solo8, 0.8 s" in capsys.readouterr().out
+
+
+def test_of_a_run_the_exported_policy_comes_first(tmp_path):
+    (tmp_path / "checkpoints").mkdir()
+    for name in ("checkpoints/latest.pt", "checkpoints/best.pt", "policy.onnx"):
+        (tmp_path / name).touch()
+        assert policies.find_policy(tmp_path) == tmp_path / name
+    assert policies.find_checkpoint(tmp_path) == tmp_path / "checkpoints/best.pt"
+
+
+def test_help_reads_like_a_manual(capsys):
+    with pytest.raises(SystemExit) as leaving:
+        main(["--help"])
+    assert leaving.value.code == 0
+    out = capsys.readouterr().out
+    for word in ("examples:", "--trace", "--script", "kiras-play --frames", "RUN", "CHECKPOINT"):
+        assert word in out
+
+
+@pytest.fixture
+def error_of(capsys):
+    """Run the command, and return the one line that it says on stderr."""
+
+    def run(*arguments):
+        assert main([str(argument) for argument in arguments]) == 2
+        captured = capsys.readouterr()
+        assert captured.err.startswith("error: ")
+        assert captured.err.count("\n") == 1
+        return captured.err
+
+    return run
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--script", "fly:4:0.3"], "unknown skill 'fly' in the script; this policy has: walk,"),
+        (["--script", "walk"], "a script's part is skill:seconds:v_x"),
+        (["--command", "fast"], "a command is v_x[,v_y[,yaw_rate]], e.g. 0.3"),
+        (["--robot", "go1"], "--robot go1 was given, but"),
+    ],
+)
+def test_a_bad_request_is_one_line(error_of, still_file, arguments, message):
+    assert message in error_of(still_file, *arguments)
+
+
+def test_a_missing_file_is_one_line(error_of, tmp_path):
+    assert "there is no file or folder" in error_of(tmp_path / "gone.onnx")
+
+
+def test_a_foreign_file_is_one_line(error_of, tmp_path):
+    (tmp_path / "a.onnx").write_text("a letter")
+    assert "is not an ONNX file that can be run" in error_of(tmp_path / "a.onnx")
+    (tmp_path / "a.txt").write_text("a letter")
+    assert "is none of: run folder, .onnx, .pt" in error_of(tmp_path / "a.txt")
+
+
+def test_a_run_without_checkpoints_is_one_line(error_of, tmp_path):
+    (tmp_path / "config.yaml").touch()
+    message = error_of(tmp_path)
+    assert "holds none of policy.onnx, checkpoints/best.pt, checkpoints/latest.pt" in message
+
+
+def test_a_folder_of_runs_names_them(error_of, tmp_path):
+    for name in ("monday", "tuesday"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "config.yaml").touch()
+    assert "it holds the runs monday, tuesday: name one of them" in error_of(tmp_path)
+
+
+def test_an_unknown_robot_is_one_line(error_of):
+    assert "there is no robot 'solo9'" in error_of("--robot", "solo9")
+
+
+def test_a_wrong_ending_is_named_with_those_that_work(still_file, capsys):
+    with pytest.raises(SystemExit) as leaving:
+        main([str(still_file), "--video", "film.gif"])
+    assert leaving.value.code == 2
+    assert "'film.gif' does not end in .mp4" in capsys.readouterr().err
+
+
+def test_a_missing_video_package_is_one_line(monkeypatch, error_of, still_file, tmp_path):
+    monkeypatch.setitem(sys.modules, "imageio.v2", None)
+    message = error_of(still_file, SHORT, "--video", tmp_path / "film.mp4")
+    assert "pip install kiras-rl[video]" in message
+
+
+def test_a_machine_without_opengl_is_one_line(monkeypatch, error_of, still_file, tmp_path):
+    monkeypatch.setenv("MUJOCO_GL", "nothing")
+    rendering.choose_backend.cache_clear()
+    message = error_of(still_file, SHORT, "--frames", tmp_path / "strip.png")
+    rendering.choose_backend.cache_clear()
+    assert "apt-get install" in message

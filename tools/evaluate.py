@@ -1,0 +1,154 @@
+"""kiras-evaluate: measure a policy by fixed protocols."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import sys
+from dataclasses import asdict
+from pathlib import Path
+
+import torch
+from rich.console import Console
+from rich.table import Table
+
+from kiras_rl.checkpoint import CheckpointError
+from kiras_rl.config import Config, ConfigError, config_from_dict, load_config
+from kiras_rl.deploy.metadata import PolicyError
+from kiras_rl.evaluation import Policy, SkillResult, evaluate_skills
+from kiras_rl.robots.robot import RobotError
+from kiras_rl.tools.evaluator import FLOOR, make_evaluation_env, results_table
+from kiras_rl.tools.policies import open_policy
+from kiras_rl.transitions import Transitions, evaluate_transitions
+
+DESCRIPTION = """\
+Measure a policy without action noise, on robots drawn by the paper's domain randomization, with
+sensor noise, actuation delay and pushes.
+
+flat         every skill walks straight ahead for 20 s; height and pitch errors are those of a 0.4 s
+             moving average after the first second, the velocity error is that of each step
+transitions  every ordered pair of skills, switched while walking: falls, and time until height
+             (1.5 cm) and pitch (3 degrees) stay at the new keyframe for 0.3 s
+"""
+
+EXAMPLES = """\
+examples:
+  kiras-evaluate                              the policy shipped with Solo-8
+  kiras-evaluate runs/solo8_quick/2026-01-31_12-00-00
+  kiras-evaluate policy.onnx --protocol transitions --trials 50 --json transitions.json
+"""
+
+console = Console()
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run the command; return its exit code."""
+    args = _parse(argv)
+    try:
+        report = evaluate(args)
+    except (ConfigError, CheckpointError, PolicyError, RobotError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    if args.json:
+        args.json.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
+    return 0
+
+
+def _parse(argv: list[str] | None) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(
+        prog="kiras-evaluate",
+        description=DESCRIPTION,
+        epilog=EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("policy", nargs="?", help="run folder, checkpoint or ONNX file")
+    parser.add_argument("--robot", default="solo8", help="whose shipped policy, if none is given")
+    parser.add_argument("--protocol", choices=("all", "flat", "transitions"), default="all")
+    parser.add_argument("--robots", type=int, default=100, help="robots a skill (flat)")
+    parser.add_argument("--duration", type=float, default=20.0, help="s a robot (flat)")
+    parser.add_argument("--trials", type=int, default=50, help="trials a pair (transitions)")
+    parser.add_argument("--command", type=float, default=0.3, help="v_x, m/s")
+    parser.add_argument("--nominal", action="store_true", help="no randomization, noise or pushes")
+    parser.add_argument("--json", type=Path, help="also write the figures to this file")
+    return parser.parse_args(argv)
+
+
+def evaluate(args: argparse.Namespace) -> dict:
+    """Run the protocols, print tables and return all figures."""
+    source = open_policy(args.policy, args.robot)
+    config = _physics(config_from_dict(source.metadata.provenance["config"]), args.nominal)
+    skills = len(source.metadata.skills)
+    report: dict = {"policy": str(source.path), "command": args.command}
+    console.print(f"{source.path}", highlight=False, soft_wrap=True)
+    if args.protocol in ("all", "flat"):
+        env = make_evaluation_env(config, args.robots * skills, args.duration)
+        results = evaluate_skills(env, source.act, args.duration, args.command)
+        console.print(results_table(results, f"flat: {args.robots} robots a skill"))
+        report["flat"] = {name: asdict(result) for name, result in results.items()}
+        _verdict(results)
+    if args.protocol in ("all", "transitions"):
+        report["transitions"] = _transitions(config, source.act, skills, args)
+    return report
+
+
+def _physics(config: Config, nominal: bool) -> Config:
+    """Return the policy's configuration with the paper's randomization, or with none."""
+    paper = load_config("base").env
+    config.env.randomization = paper.randomization
+    config.env.observations.noise = not nominal
+    config.env.skills = paper.skills
+    if nominal:
+        for name, value in vars(config.env.randomization).items():
+            if name != "push_interval" and value is not None:
+                setattr(config.env.randomization, name, None)
+    return config
+
+
+def _verdict(results: dict[str, SkillResult]) -> None:
+    target = {"height": 0.01, "pitch": math.radians(2.0), "velocity": 0.08, "falls": 0.0}
+    for name, limits in (("floor", FLOOR), ("target", target)):
+        met = [skill for skill, result in results.items() if result.meets(**limits)]
+        console.print(f"{name}: {len(met)} of {len(results)} skills ({', '.join(met) or 'none'})")
+
+
+def _transitions(config: Config, policy: Policy, skills: int, args: argparse.Namespace) -> dict:
+    worlds = skills * (skills - 1) * args.trials
+    env = make_evaluation_env(config, worlds, 10.0)
+    result = evaluate_transitions(env, policy, args.trials, args.command)
+    console.print(_transition_table(result, env.skills))
+    fell, settled = result.overall()
+    console.print(f"falls {100 * fell:.1f} %, settled within 2 s {100 * settled:.1f} %")
+    return {
+        "skills": list(env.skills),
+        "fell": result.fell.nan_to_num().tolist(),
+        "settled": result.settled.nan_to_num().tolist(),
+        "settle_time": result.settle_time.nan_to_num().tolist(),
+        "overall": {"fell": fell, "settled": settled},
+    }
+
+
+def _transition_table(result: Transitions, skills: tuple[str, ...]) -> Table:
+    title = f"transitions: settled %, mean settle time s, falls % ({result.trials} trials a pair)"
+    table = Table(title=title, title_justify="left")
+    table.add_column("from / to")
+    for skill in skills:
+        table.add_column(skill, justify="right")
+    for i, first in enumerate(skills):
+        cells = [
+            ""
+            if i == j
+            else _cell(result.settled[i, j], result.settle_time[i, j], result.fell[i, j])
+            for j in range(len(skills))
+        ]
+        table.add_row(first, *cells)
+    return table
+
+
+def _cell(settled: torch.Tensor, time: torch.Tensor, fell: torch.Tensor) -> str:
+    falls = f" [red]{100 * fell:.0f}[/]" if fell > 0 else ""
+    return f"{100 * settled:.0f} {time:.2f}{falls}"
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,65 @@
+"""The evaluation environment of a configuration, and tables of its results."""
+
+from __future__ import annotations
+
+import copy
+import math
+
+from rich.table import Table
+
+from kiras_rl.config import Config
+from kiras_rl.envs import make_env
+from kiras_rl.envs.quadruped import QuadrupedEnv
+from kiras_rl.evaluation import Policy, SkillResult, evaluate_skills
+from kiras_rl.runner import Evaluate
+
+FLOOR = {"height": 0.03, "pitch": math.radians(5.0), "velocity": 0.12, "falls": 0.05}
+"""What a skill must reach to be called learned: m, rad, m/s, share of robots."""
+
+
+def make_evaluation_env(
+    config: Config, num_envs: int, duration: float, device: str = "cpu"
+) -> QuadrupedEnv:
+    """Build an environment with the run's physics, in which no trial is cut short."""
+    config = copy.deepcopy(config)
+    config.env.terminations.episode_length = duration + 1.0
+    config.env.terminations.random_first_length = False
+    return make_env(config, device, num_envs)
+
+
+def make_evaluator(config: Config, device: str) -> Evaluate | None:
+    """Return the evaluation that runs beside a training; None where it is switched off."""
+    settings = config.evaluation
+    if not settings.interval:
+        return None
+    from kiras_rl.robots.robot import load_robot
+
+    num_envs = settings.worlds_per_skill * len(load_robot(config.robot).skills)
+    env = make_evaluation_env(config, num_envs, settings.duration, device)
+
+    def evaluate(policy: Policy) -> dict[str, SkillResult]:
+        return evaluate_skills(env, policy, settings.duration, settings.command)
+
+    return evaluate
+
+
+def results_table(results: dict[str, SkillResult], title: str) -> Table:
+    """Return a table with one row a skill; green rows reach FLOOR."""
+    columns = ("skill", "height", "error", "pitch", "error", "v_x", "error", "lifts", "falls")
+    units = ("", "cm", "cm", "deg", "deg", "m/s", "m/s", "1/s", "%")
+    table = Table(title=title, title_justify="left")
+    for column, unit in zip(columns, units, strict=True):
+        table.add_column(f"{column}\n{unit}", justify="right" if unit else "left")
+    for skill, r in results.items():
+        row = (
+            f"{100 * r.height:.1f}",
+            f"{100 * r.height_error:.1f}",
+            f"{math.degrees(r.pitch):+.1f}",
+            f"{math.degrees(r.pitch_error):.1f}",
+            f"{r.velocity:+.2f}",
+            f"{r.velocity_error:.2f}",
+            f"{r.lifts:.1f}",
+            f"{100 * r.falls:.0f}",
+        )
+        table.add_row(skill, *row, style="green" if r.meets(**FLOOR) else "yellow")
+    return table
