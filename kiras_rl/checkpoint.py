@@ -17,6 +17,19 @@ FORMAT = 1
 FOLDER = "checkpoints"
 LATEST, BEST = "latest.pt", "best.pt"
 
+# What torch.load raises on files that are no zip archives of tensors, truncated, or hold code.
+_UNREADABLE = (
+    AttributeError,
+    EOFError,
+    IndexError,
+    KeyError,
+    OSError,
+    RuntimeError,
+    ValueError,
+    pickle.UnpicklingError,
+    zipfile.BadZipFile,
+)
+
 
 class CheckpointError(ValueError):
     """A file that is no usable checkpoint: says which and why."""
@@ -51,7 +64,7 @@ def load_checkpoint(path: Path) -> dict:
         raise CheckpointError(f"no checkpoint at {path}")
     try:
         content = torch.load(path, map_location="cpu", weights_only=True)
-    except (pickle.UnpicklingError, RuntimeError, EOFError, OSError, zipfile.BadZipFile) as error:
+    except _UNREADABLE as error:
         reason = str(error).splitlines()[0][:120] if str(error) else type(error).__name__
         raise CheckpointError(
             f"{path} is not a whole KiRAS checkpoint ({reason}); the run's other checkpoints are "

@@ -124,6 +124,7 @@ class DiscriminatorConfig:
     learning_rate: float
     updates: int
     batch_size: int
+    gradient_penalty: float
     noise: list[list[float]]
 
 
@@ -136,6 +137,7 @@ class PremiumConfig:
     capacity: int
     max_age: int
     min_command: float
+    max_distance: float
     per_iteration: int
     keyframe_share: float
     distance_weight: float
@@ -301,19 +303,34 @@ def _resolve(layers: list[dict], overrides: list[str], source: str) -> Config:
         config = _merge(config, layer, source)
     for item in overrides:
         config = _merge(config, _parse_override(item), f"override '{item}'")
-    missing = sorted(OmegaConf.missing_keys(config))
+    try:
+        missing = sorted(OmegaConf.missing_keys(config))
+        result = None if missing else OmegaConf.to_object(config)
+    except OmegaConfBaseException as error:  # a reference ${...} that leads nowhere
+        raise ConfigError(_explain(error, source)) from None
     if missing:
         raise ConfigError(f"{source} leaves out: {', '.join(missing)}; extend base or set them")
-    result = OmegaConf.to_object(config)
     assert isinstance(result, Config)
+    for key in ("num_envs", "iterations"):
+        if getattr(result, key) < 1:
+            raise ConfigError(f"{key}={getattr(result, key)}: at least 1")
     return result
+
+
+def _explain(error: OmegaConfBaseException, source: str) -> str:
+    key = getattr(error, "full_key", None)
+    return ": ".join([source, *([key] if key else []), str(error).splitlines()[0]])
 
 
 def _parse_override(item: str) -> DictConfig:
     key, separator, _ = item.partition("=")
     if not separator or not key:
         raise ConfigError(f"'{item}' is not an override; write key=value, as in num_envs=512")
-    return OmegaConf.from_dotlist([item])
+    try:
+        return OmegaConf.from_dotlist([item])
+    except Exception as error:  # the YAML parser's own errors are of many kinds
+        reason = " ".join(str(error).split())
+        raise ConfigError(f"override '{item}' is not readable: {reason}") from None
 
 
 def _merge(config: DictConfig, layer: dict | DictConfig, source: str) -> DictConfig:
@@ -321,26 +338,23 @@ def _merge(config: DictConfig, layer: dict | DictConfig, source: str) -> DictCon
     try:
         return OmegaConf.merge(config, layer)
     except OmegaConfBaseException as error:
-        key = getattr(error, "full_key", None) or "?"
-        reason = str(error).splitlines()[0]
-        raise ConfigError(f"{source}: {key}: {reason}") from None
+        raise ConfigError(_explain(error, source)) from None
 
 
 def _check_keys(config: DictConfig, layer: DictConfig, source: str, prefix: str = "") -> None:
     """Raise at the first key of `layer` that the typed configuration does not have."""
     kind = OmegaConf.get_type(config)
-    if kind is None or kind is dict:
-        return  # terms: their names are checked where they are looked up
+    if kind in (None, dict, type(None)):
+        return  # terms are checked where they are looked up, a block that was null by the merge
     allowed = list(kind.__dataclass_fields__)
     for key in layer:
         if key not in allowed:
             hint = difflib.get_close_matches(str(key), allowed, n=1)
-            meant = f"; did you mean '{prefix}{hint[0]}'?" if hint else ""
+            meant = f"; did you mean '{prefix}{hint[0]}'?" if hint else "."
             raise ConfigError(
                 f"{source}: unknown key '{prefix}{key}'{meant} Allowed: {', '.join(allowed)}"
             )
-        child = OmegaConf.select(layer, key) if not OmegaConf.is_missing(layer, key) else None
-        known = config._get_node(key)
+        child, known = layer._get_node(key), config._get_node(key)
         if isinstance(child, DictConfig) and isinstance(known, DictConfig):
             _check_keys(known, child, source, f"{prefix}{key}.")
 
@@ -362,6 +376,8 @@ def _read_chain(name: str) -> list[dict]:
         if not isinstance(values, dict):
             raise ConfigError(f"{path} holds no keys: a configuration is a YAML mapping")
         current = values.pop("extends", None)
+        if not isinstance(current, str | None):
+            raise ConfigError(f"{path}: extends: give one name, not {current}")
         layers.append(values)
     return layers[::-1]
 

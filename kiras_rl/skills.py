@@ -11,8 +11,9 @@ def skill_probabilities(values: torch.Tensor, floor: float) -> torch.Tensor:
     """Return p_i = (1 - V_i / sum V) / (S - 1), made safe.
 
     The paper's formula needs positive values: a negative sum turns the ranking round. Values are
-    therefore shifted by their minimum when it is negative, and no probability falls below `floor`.
-    For positive values and no p_i under the floor this is the paper's formula.
+    therefore shifted by their minimum when it is negative, and no probability falls below `floor`:
+    what the others have above it pays. For positive values and no p_i under the floor this is the
+    paper's formula.
 
     Args:
         values: Task values of the skills at their keyframes, (S,).
@@ -26,8 +27,8 @@ def skill_probabilities(values: torch.Tensor, floor: float) -> torch.Tensor:
     shifted = values - lowest + torch.where(lowest < 0, 1e-3 * spread, 0.0)
     total = shifted.sum()
     share = torch.where(total > 0, shifted / total.clamp(min=1e-12), 1.0 / len(values))
-    probabilities = ((1.0 - share) / (len(values) - 1)).clamp(min=floor)
-    return probabilities / probabilities.sum()
+    excess = ((1.0 - share) / (len(values) - 1) - floor).clamp(min=0.0)
+    return floor + excess * ((1.0 - len(values) * floor) / excess.sum().clamp(min=1e-12))
 
 
 def cover_all_skills(probabilities: torch.Tensor, practised: torch.Tensor) -> torch.Tensor:

@@ -18,8 +18,13 @@ from kiras_rl.config import Config, ConfigError, config_from_dict, load_config
 from kiras_rl.deploy.metadata import PolicyError
 from kiras_rl.evaluation import Policy, SkillResult, evaluate_skills
 from kiras_rl.robots.robot import RobotError
-from kiras_rl.tools.evaluator import FLOOR, make_evaluation_env, results_table
-from kiras_rl.tools.policies import open_policy
+from kiras_rl.tools.evaluator import (
+    FLOOR,
+    make_evaluation_env,
+    onboard_policy,
+    results_table,
+)
+from kiras_rl.tools.policy_files import load_policy
 from kiras_rl.transitions import Transitions, evaluate_transitions
 
 DESCRIPTION = """\
@@ -62,8 +67,8 @@ def _parse(argv: list[str] | None) -> argparse.Namespace:
         epilog=EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("policy", nargs="?", help="run folder, checkpoint or ONNX file")
-    parser.add_argument("--robot", default="solo8", help="whose shipped policy, if none is given")
+    parser.add_argument("policy", nargs="?", type=Path, help="run folder, checkpoint or ONNX file")
+    parser.add_argument("--robot", help="whose shipped policy, if none is given (solo8)")
     parser.add_argument("--protocol", choices=("all", "flat", "transitions"), default="all")
     parser.add_argument("--robots", type=int, default=100, help="robots a skill (flat)")
     parser.add_argument("--duration", type=float, default=20.0, help="s a robot (flat)")
@@ -76,19 +81,19 @@ def _parse(argv: list[str] | None) -> argparse.Namespace:
 
 def evaluate(args: argparse.Namespace) -> dict:
     """Run the protocols, print tables and return all figures."""
-    source = open_policy(args.policy, args.robot)
-    config = _physics(config_from_dict(source.metadata.provenance["config"]), args.nominal)
-    skills = len(source.metadata.skills)
-    report: dict = {"policy": str(source.path), "command": args.command}
-    console.print(f"{source.path}", highlight=False, soft_wrap=True)
+    onboard = load_policy(args.policy, args.robot)
+    metadata, policy = onboard.metadata, onboard_policy(onboard)
+    config = _physics(config_from_dict(metadata.provenance["config"]), args.nominal)
+    skills = len(metadata.skills)
+    report: dict = {"provenance": metadata.provenance, "command": args.command}
     if args.protocol in ("all", "flat"):
         env = make_evaluation_env(config, args.robots * skills, args.duration)
-        results = evaluate_skills(env, source.act, args.duration, args.command)
+        results = evaluate_skills(env, policy, args.duration, args.command)
         console.print(results_table(results, f"flat: {args.robots} robots a skill"))
         report["flat"] = {name: asdict(result) for name, result in results.items()}
         _verdict(results)
     if args.protocol in ("all", "transitions"):
-        report["transitions"] = _transitions(config, source.act, skills, args)
+        report["transitions"] = _transitions(config, policy, skills, args)
     return report
 
 

@@ -5,12 +5,17 @@ from __future__ import annotations
 import copy
 import math
 
+import torch
 from rich.table import Table
+from tensordict import TensorDict
 
 from kiras_rl.config import Config
+from kiras_rl.deploy.policy import OnboardPolicy
 from kiras_rl.envs import make_env
 from kiras_rl.envs.quadruped import QuadrupedEnv
 from kiras_rl.evaluation import Policy, SkillResult, evaluate_skills
+from kiras_rl.interfaces import HISTORY, PROPRIO
+from kiras_rl.robots.robot import load_robot
 from kiras_rl.runner import Evaluate
 
 FLOOR = {"height": 0.03, "pitch": math.radians(5.0), "velocity": 0.12, "falls": 0.05}
@@ -32,8 +37,6 @@ def make_evaluator(config: Config, device: str) -> Evaluate | None:
     settings = config.evaluation
     if not settings.interval:
         return None
-    from kiras_rl.robots.robot import load_robot
-
     num_envs = settings.worlds_per_skill * len(load_robot(config.robot).skills)
     env = make_evaluation_env(config, num_envs, settings.duration, device)
 
@@ -41,6 +44,16 @@ def make_evaluator(config: Config, device: str) -> Evaluate | None:
         return evaluate_skills(env, policy, settings.duration, settings.command)
 
     return evaluate
+
+
+def onboard_policy(policy: OnboardPolicy) -> Policy:
+    """Return observation -> mean actions of a policy file: what is measured is what is deployed."""
+
+    def act(obs: TensorDict) -> torch.Tensor:
+        actions, _ = policy.infer(obs[PROPRIO].cpu().numpy(), obs[HISTORY].cpu().numpy())
+        return torch.from_numpy(actions).to(obs.device)
+
+    return act
 
 
 def results_table(results: dict[str, SkillResult], title: str) -> Table:

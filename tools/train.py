@@ -22,11 +22,13 @@ from kiras_rl.config import (
     load_config,
     save_config,
 )
+from kiras_rl.deploy.policy import OnboardPolicy
 from kiras_rl.envs import make_env, resolve_backend
+from kiras_rl.export import export_policy
 from kiras_rl.robots.robot import RobotError
 from kiras_rl.runner import KirasRunner
-from kiras_rl.tools.evaluator import make_evaluator, results_table
-from kiras_rl.tools.policies import as_function
+from kiras_rl.tools.curves import draw_curves
+from kiras_rl.tools.evaluator import make_evaluator, onboard_policy, results_table
 from kiras_rl.tools.progress import Progress
 
 DESCRIPTION = """\
@@ -157,17 +159,11 @@ def _announce(config: Config, runner: KirasRunner, run_dir: Path, source: Path |
 
 def _conclude(runner: KirasRunner, run_dir: Path) -> None:
     """Export the best policy, draw the curves, and say what there is and what to type next."""
-    from kiras_rl.deploy.metadata import PolicyMetadata
-    from kiras_rl.export import export_policy
-    from kiras_rl.tools.curves import draw_curves
-
     best = checkpoint.find_checkpoint(run_dir)
-    policy, description = checkpoint.load_policy(best)
-    onnx = run_dir / "policy.onnx"
-    export_policy(policy, PolicyMetadata.from_dict(description), onnx)
+    onnx = export_policy(*checkpoint.load_policy(best), run_dir / "policy.onnx").path
     curves = draw_curves(run_dir)
     if runner.evaluate:
-        results = runner.evaluate(as_function(policy))
+        results = runner.evaluate(onboard_policy(OnboardPolicy(onnx)))
         console.print(results_table(results, "best policy, without action noise, v_x = 0.3 m/s"))
     console.print(
         f"{runner.seconds / 60:.1f} min of training\n"

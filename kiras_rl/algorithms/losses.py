@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import torch
+from torch import nn
 
 
 def surrogate_loss(
@@ -47,6 +48,27 @@ def discriminator_loss(
     weight = valid.float()
     policy_part = ((policy + 1.0).square() * weight).sum() / weight.sum().clamp(min=1.0)
     return (expert - 1.0).square().mean() + policy_part
+
+
+def gradient_penalty(
+    discriminator: nn.Module, expert: torch.Tensor, policy: torch.Tensor, features: torch.Tensor
+) -> torch.Tensor:
+    """Return E |dD/dx|^2 on random points between expert and policy pairs of the same skill.
+
+    It makes D change steadily from the one to the other, so that a motion far from its keyframe
+    still learns in which direction the keyframe lies.
+
+    Args:
+        discriminator: (B, 2 D) -> (B,).
+        expert: Expert pairs, (B, 2 D).
+        policy: Pairs of the policy, (B, 2 D).
+        features: Inputs that count, (2 D,) bool; the code of the skill does not.
+    """
+    blend = torch.rand(len(expert), 1, device=expert.device)
+    points = (blend * expert + (1.0 - blend) * policy).requires_grad_()
+    scores = discriminator(points)
+    (gradient,) = torch.autograd.grad(scores.sum(), points, create_graph=True)
+    return (gradient * features).square().sum(-1).mean()
 
 
 def gaussian_kl(

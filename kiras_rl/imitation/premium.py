@@ -113,10 +113,11 @@ class PremiumSelector:
     def _complete(self, full: torch.Tensor) -> None:
         config = self._config
         moving = self._speed / config.window >= config.min_command
+        near = self._distance / config.window <= config.max_distance
         score = trajectory_scores(
             self._reward, self._distance, config.window, config.distance_weight
         )
-        eligible = full & moving
+        eligible = full & moving & near
         self._completed_score = torch.where(eligible, score, self._completed_score)
         self._completed_skill = torch.where(eligible, self._skill, self._completed_skill)
         self._completed_at = torch.where(eligible, self._position, self._completed_at)

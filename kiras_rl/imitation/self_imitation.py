@@ -6,7 +6,7 @@ import torch
 from tensordict import TensorDict
 
 from kiras_rl import interfaces as names
-from kiras_rl.algorithms.losses import discriminator_loss
+from kiras_rl.algorithms.losses import discriminator_loss, gradient_penalty
 from kiras_rl.algorithms.storage import GroupRolloutStorage
 from kiras_rl.config import ImitationConfig
 from kiras_rl.imitation.premium import PremiumSelector
@@ -131,9 +131,14 @@ class SelfImitation:
         drawn = torch.randint(len(pairs), (size,), device=pairs.device)
         expert = self.selector.sample(skill[drawn])
         both = torch.cat([expert, pairs[drawn]])
-        scores = self.discriminator(both + noise * self._noise * torch.randn_like(both))
-        expert_score, policy_score = scores.chunk(2)
+        both = both + noise * self._noise * torch.randn_like(both)
+        expert_score, policy_score = self.discriminator(both).chunk(2)
         loss = discriminator_loss(expert_score, policy_score, valid[drawn])
+        weight = self.config.discriminator.gradient_penalty
+        if weight > 0:
+            loss = loss + weight * gradient_penalty(
+                self.discriminator, *both.chunk(2), features=self._noise > 0
+            )
         self.optimizer.zero_grad()
         loss.backward()
         self.optimizer.step()

@@ -1,4 +1,4 @@
-"""The robot sees what training saw: the environment's observations, rebuilt from sensor readings."""
+"""The robot sees what training saw: the environment's observations, rebuilt from readings."""
 
 from __future__ import annotations
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from kiras_rl.robots.robot import load_robot
-from kiras_rl.tools import policies, rendering
+from kiras_rl.tools import policy_files, rendering
 from kiras_rl.tools.play import main
 
 SHORT = "--script=walk:0.4:0.3,crawl:0.4:0.3"
@@ -51,7 +51,7 @@ def test_a_strip_of_pictures_is_drawn(still_file, tmp_path):
 
 
 def test_the_policy_that_comes_with_a_robot_is_taken(monkeypatch, still_file, tmp_path, capsys):
-    monkeypatch.setattr(policies, "shipped_policy", lambda robot: still_file)
+    monkeypatch.setattr(policy_files, "shipped_policy", lambda robot: still_file)
     assert main([SHORT]) == 0
     assert "solo8, 0.8 s" in capsys.readouterr().out
 
@@ -60,8 +60,8 @@ def test_of_a_run_the_exported_policy_comes_first(tmp_path):
     (tmp_path / "checkpoints").mkdir()
     for name in ("checkpoints/latest.pt", "checkpoints/best.pt", "policy.onnx"):
         (tmp_path / name).touch()
-        assert policies.find_policy(tmp_path) == tmp_path / name
-    assert policies.find_checkpoint(tmp_path) == tmp_path / "checkpoints/best.pt"
+        assert policy_files.find_policy(tmp_path) == tmp_path / name
+    assert policy_files.find_checkpoint(tmp_path) == tmp_path / "checkpoints/best.pt"
 
 
 def test_help_reads_like_a_manual(capsys):

@@ -1,0 +1,69 @@
+"""Storage of groups, and how it is cut into batches."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from kiras_rl.algorithms.storage import GroupRolloutStorage, mini_batches
+
+STEPS, WORLDS, ACTIONS = 3, 4, 2
+
+
+def step(value):
+    """Return a transition whose every number tells the step and the world."""
+    number = value + torch.arange(WORLDS).float()[:, None] / 10
+    transition = GroupRolloutStorage.Transition()
+    transition.observations = TensorDict({"a": number}, batch_size=[WORLDS])
+    transition.actions = number.expand(-1, ACTIONS)
+    transition.rewards = torch.cat([number, -number], dim=1)
+    transition.values = torch.cat([10 * number, -10 * number], dim=1)
+    transition.dones = number.squeeze(1) > 1.2
+    transition.actions_log_prob = number.squeeze(1)
+    transition.distribution_params = (number.expand(-1, ACTIONS), torch.ones(WORLDS, ACTIONS))
+    return transition
+
+
+@pytest.fixture
+def storage():
+    obs = TensorDict({"a": torch.zeros(WORLDS, 1)}, batch_size=[WORLDS])
+    return GroupRolloutStorage(WORLDS, STEPS, 2, obs, ACTIONS, "cpu")
+
+
+def test_every_group_has_its_column(storage):
+    for t in range(STEPS):
+        storage.add_transition(step(t))
+    number = torch.arange(3.0)[:, None] + torch.arange(4.0) / 10
+    torch.testing.assert_close(storage.rewards, torch.stack([number, -number], dim=-1))
+    torch.testing.assert_close(storage.values, 10 * storage.rewards)
+    torch.testing.assert_close(storage.observations["a"], number[..., None])
+    torch.testing.assert_close(storage.actions_log_prob, number[..., None])
+    torch.testing.assert_close(storage.distribution_params[0], number[..., None].expand(3, 4, 2))
+    assert storage.dones.squeeze(-1).int().tolist() == [[0] * 4, [0, 0, 0, 1], [1] * 4]
+
+
+def test_a_full_rollout_takes_no_more_until_it_is_cleared(storage):
+    for t in range(STEPS):
+        storage.add_transition(step(t))
+    with pytest.raises(OverflowError, match="clear"):
+        storage.add_transition(step(3))
+    storage.clear()
+    storage.add_transition(step(3))
+    assert storage.rewards[0, 0, 0] == 3.0
+
+
+def test_shuffled_tensors_keep_their_rows_together(storage):
+    number = torch.arange(STEPS * WORLDS).view(STEPS, WORLDS)
+    data = storage.shuffled(a=number, b=10 * number[..., None])
+    assert data["a"].sort().values.tolist() == list(range(12))
+    assert data["a"].tolist() != list(range(12))
+    assert torch.equal(data["b"].squeeze(1), 10 * data["a"])
+
+
+def test_an_epoch_shows_every_row_once():
+    data = {"a": torch.arange(12), "b": torch.arange(12) * 2}
+    batches = list(mini_batches(data, count=4, epochs=2))
+    assert [len(b["a"]) for b in batches] == [3] * 8
+    assert torch.cat([b["a"] for b in batches[:4]]).tolist() == list(range(12))
+    assert all(torch.equal(b["b"], 2 * b["a"]) for b in batches)

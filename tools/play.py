@@ -1,0 +1,144 @@
+"""kiras-play: drive one simulated robot with a policy, and show how it went."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from rich.console import Console
+
+from kiras_rl.deploy.policy import PolicyError
+from kiras_rl.robots.robot import RobotError
+from kiras_rl.tools import policy_files, summary
+from kiras_rl.tools.driver import (
+    Driver,
+    Segment,
+    Trace,
+    default_script,
+    parse_command,
+    parse_script,
+    record,
+)
+from kiras_rl.tools.rendering import RenderError
+
+_DESCRIPTION = """\
+Drive one simulated robot on flat ground with a trained policy, through the same code that runs on
+a real robot, and show how it went: a table of every skill's errors, or pictures.
+
+The policy is one of
+  RUN          a run folder: its policy.onnx, else checkpoints/best.pt, else checkpoints/latest.pt
+  CHECKPOINT   a .pt file of a run
+  ONNX         a policy file written by kiras-train or kiras-export
+  (nothing)    the policy that comes with the robot
+
+Without --script the robot stands for one second and then shows every skill for four. A robot that
+falls is put back into the posture of its skill. Exit status: 0, or 2 if something was wrong with
+what was given.
+"""
+
+_EXAMPLES = """\
+examples:
+  kiras-play                                        the shipped policy: a table
+  kiras-play runs/solo8/2026-01-01_12-00-00         the policy of a run
+  kiras-play --trace trace.png                      posture, speed, contacts, torques over time
+  kiras-play --frames strip.png --video walk.mp4    pictures and a film
+  kiras-play --command 0.5,0,0.3                    every skill, turning left at 0.3 rad/s
+  kiras-play --script walk:4:0.3,crawl:4:0.3        skill:seconds:v_x[:v_y[:yaw_rate]], ...
+"""
+
+_PICTURES = (".png", ".jpg", ".pdf", ".svg")
+_OUTPUTS = {
+    "--trace": ((*_PICTURES, ".npz"), "everything over time, drawn or as arrays"),
+    "--frames": (_PICTURES, "a strip of pictures for every skill"),
+    "--video": ((".mp4",), "a film; needs kiras-rl[video]"),
+}
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command; return its exit status."""
+    options = _parser().parse_args(arguments)
+    try:
+        _play(options)
+    except (PolicyError, RobotError, RenderError, OSError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    return 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="kiras-play",
+        description=_DESCRIPTION,
+        epilog=_EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    add = parser.add_argument
+    add("policy", nargs="?", type=Path, metavar="POLICY", help="RUN, CHECKPOINT or ONNX, as above")
+    add("--robot", metavar="NAME", help="whose shipped policy to take (solo8)")
+    tasks = parser.add_mutually_exclusive_group()
+    tasks.add_argument(
+        "--script", metavar="TEXT", help="what to do: skill:seconds:v_x[:v_y[:yaw_rate]], ..."
+    )
+    tasks.add_argument(
+        "--command",
+        default="0.3",
+        metavar="V_X[,V_Y[,YAW]]",
+        help="command for every skill, m/s and rad/s (0.3)",
+    )
+    for name, (endings, text) in _OUTPUTS.items():
+        add(name, type=_file(endings), metavar="FILE", help=f"{text} ({' '.join(endings)})")
+    return parser
+
+
+def _file(endings: tuple[str, ...]) -> Callable[[str], Path]:
+    def check(text: str) -> Path:
+        if Path(text).suffix not in endings:
+            raise argparse.ArgumentTypeError(f"'{text}' does not end in {' '.join(endings)}")
+        return Path(text)
+
+    return check
+
+
+def _play(options: argparse.Namespace) -> None:
+    driver = Driver(policy_files.load_policy(options.policy, options.robot))
+    trace = record(driver, _script(options, driver))
+    if not (options.trace or options.frames or options.video):
+        rows = summary.summarize(trace, driver.metadata)
+        Console().print(summary.table(rows, f"{driver.metadata.robot}, {trace.time[-1]:.3g} s"))
+    if options.trace:
+        _save_trace(trace, driver, options.trace)
+    if options.frames or options.video:
+        _save_pictures(trace, driver, options)
+
+
+def _script(options: argparse.Namespace, driver: Driver) -> list[Segment]:
+    if options.script is not None:
+        return parse_script(options.script, driver.metadata)
+    return default_script(driver.metadata, parse_command(options.command))
+
+
+def _save_trace(trace: Trace, driver: Driver, path: Path) -> None:
+    if path.suffix == ".npz":
+        path.parent.mkdir(parents=True, exist_ok=True)
+        trace.save(path)
+    else:
+        from kiras_rl.tools.trace_figure import save_trace_figure  # matplotlib takes a second
+
+        save_trace_figure(trace, driver.metadata, path)
+    print(f"wrote {path}")
+
+
+def _save_pictures(trace: Trace, driver: Driver, options: argparse.Namespace) -> None:
+    from kiras_rl.tools.film import save_strips, save_video
+
+    tallest = max(posture.base_height for posture in driver.metadata.keyframes.values())
+    for path, save in ((options.frames, save_strips), (options.video, save_video)):
+        if path:
+            save(trace, driver.model, tallest, path)
+            print(f"wrote {path}")
+
+
+if __name__ == "__main__":
+    sys.exit(main())
