@@ -194,14 +194,12 @@ class PPOConfig:
     gamma: float
     lam: float
     clip_param: float
-    entropy_coef: float
     value_loss_coef: float
     max_grad_norm: float
     learning_rate: float
     learning_rate_range: tuple[float, float]
     desired_kl: float
-    init_std: float
-    std_cap: list[list[float]]
+    action_std: list[list[float]]
     actor_dims: list[int]
     critic_dims: list[int]
     only_positive_rewards: bool

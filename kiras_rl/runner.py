@@ -12,6 +12,7 @@ from pathlib import Path
 import torch
 from rsl_rl.runners import OnPolicyRunner
 from rsl_rl.utils import check_nan
+from tensordict import TensorDict
 from torch.utils.tensorboard import SummaryWriter
 
 from kiras_rl import __version__, checkpoint
@@ -22,6 +23,10 @@ from kiras_rl.evaluation import Policy, SkillResult, as_scalars, score
 from kiras_rl.interfaces import SkillEnv
 
 Evaluate = Callable[[Policy], dict[str, SkillResult]]
+
+
+class TrainingError(ValueError):
+    """A training that cannot go on: says where it broke and what is left."""
 
 
 @dataclass
@@ -166,10 +171,20 @@ class KirasRunner(OnPolicyRunner):
                     totals[key] = totals[key] + value if key in totals else value
             # Once a rollout: every check waits for the device. NaN in an earlier step is still
             # there, in the history of observations or in the stored rewards.
-            check_nan(obs, self.alg.storage.rewards, self.alg.storage.dones)
+            self._check_finite(obs)
             self.alg.compute_returns(obs)
         counts = ("Episode/", "Sim/", "Perf/")
         return {k: v if k.startswith(counts) else v / num_steps for k, v in totals.items()}
+
+    def _check_finite(self, obs: TensorDict) -> None:
+        try:
+            check_nan(obs, self.alg.storage.rewards, self.alg.storage.dones)
+        except ValueError as error:
+            raise TrainingError(
+                f"iteration {self.current_learning_iteration + 1}: {error} Worlds that diverge are "
+                "reset before this, so look at your own terms or lower learner.ppo.learning_rate; "
+                f"the last checkpoint stays as it is ({self.run_dir})"
+            ) from None
 
     def _renew_skill_probabilities(self, scalars: dict[str, float]) -> None:
         probabilities = self.alg.skill_probabilities(self.env.keyframe_observations())

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-MODES = ("gate_update", "bootstrap_input", "both", "off")
+MODES = ("gate_update", "bootstrap_input", "both", "none")
 _MIN_WORLDS = 64  # with completed episodes, before their spread means anything
 
 

@@ -59,7 +59,7 @@ class KirasPPO(PPO):
             gamma=ppo.gamma,
             lam=ppo.lam,
             value_loss_coef=ppo.value_loss_coef,
-            entropy_coef=ppo.entropy_coef,
+            entropy_coef=0.0,  # the noise is scheduled: its entropy has no gradient
             learning_rate=ppo.learning_rate,
             max_grad_norm=ppo.max_grad_norm,
             desired_kl=ppo.desired_kl,
@@ -179,23 +179,22 @@ class KirasPPO(PPO):
             mean=mean,
             std=std,
         )
-        totals = torch.zeros(4, device=self.device)
+        totals = torch.zeros(3, device=self.device)
         for batch in mini_batches(data, self.num_mini_batches, self.num_learning_epochs):
             totals += self._policy_step(batch)
-        surrogate, value, entropy, kl = (
+        surrogate, value, kl = (
             totals / (self.num_mini_batches * self.num_learning_epochs)
         ).tolist()
         return {
             "Loss/surrogate": surrogate,
             "Loss/value": value,
-            "Loss/entropy": entropy,
             "Policy/kl": kl,
             "Policy/learning_rate": self.learning_rate,
             "Policy/action_std": self.actor.output_std.mean().item(),
         }
 
     def _policy_step(self, batch: dict[str, torch.Tensor]) -> torch.Tensor:
-        """Take one gradient step; return (surrogate, value, entropy, KL), (4,)."""
+        """Take one gradient step; return (surrogate, value, KL), (3,)."""
         distribution = self.actor.distribution
         distribution.update(self.actor.mlp(batch["actor_obs"]))
         log_prob = distribution.log_prob(batch["actions"])
@@ -206,14 +205,13 @@ class KirasPPO(PPO):
             self.clip_param,
         )  # fmt: skip
         value = losses.value_loss(values, batch["returns"])
-        entropy = distribution.entropy.mean()
-        loss = surrogate + self.value_loss_coef * value - self.entropy_coef * entropy
+        loss = surrogate + self.value_loss_coef * value
         self.optimizer.zero_grad()
         loss.backward()
         for network in (self.actor, *self.critic.critics):
             nn.utils.clip_grad_norm_(network.parameters(), self.max_grad_norm)
         self.optimizer.step()
-        return torch.stack([surrogate, value, entropy, kl]).detach()
+        return torch.stack([surrogate, value, kl]).detach()
 
     @torch.no_grad()
     def _adapt_to_kl(self, old_params: tuple[torch.Tensor, ...]) -> torch.Tensor:
@@ -228,10 +226,9 @@ class KirasPPO(PPO):
         return kl
 
     def _apply_schedules(self) -> None:
-        """Lower the cap of the action noise: noise must not carry the gait."""
-        cap = piecewise_linear(self.config.ppo.std_cap, self.progress)
-        distribution = self.actor.distribution
-        distribution.log_std_range[1] = float(torch.tensor(cap).log())
+        """Set the action noise of the next rollout."""
+        std = piecewise_linear(self.config.ppo.action_std, self.progress)
+        self.actor.distribution.std_param.fill_(std)
 
     # --- skills ---------------------------------------------------------------------------------
 
@@ -342,8 +339,8 @@ def _build_actor(
 ) -> MLPModel:
     distribution = {
         "class_name": "GaussianDistribution",
-        "init_std": config.ppo.init_std,
-        "std_type": "log",
+        "init_std": config.ppo.action_std[0][1],
+        "learn_std": False,
     }
     actor = MLPModel(
         obs, groups, "actor", num_actions, list(config.ppo.actor_dims), "elu", False, distribution
