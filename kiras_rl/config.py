@@ -198,7 +198,7 @@ class PPOConfig:
     max_grad_norm: float
     learning_rate: float
     learning_rate_range: tuple[float, float]
-    desired_kl: float
+    desired_kl: list[list[float]]
     action_std: list[list[float]]
     actor_dims: list[int]
     critic_dims: list[int]

@@ -62,7 +62,6 @@ class KirasPPO(PPO):
             entropy_coef=0.0,  # the noise is scheduled: its entropy has no gradient
             learning_rate=ppo.learning_rate,
             max_grad_norm=ppo.max_grad_norm,
-            desired_kl=ppo.desired_kl,
             device=device,
         )
         parameters = chain(actor.parameters(), critic.parameters())
@@ -226,9 +225,10 @@ class KirasPPO(PPO):
         return kl
 
     def _apply_schedules(self) -> None:
-        """Set the action noise of the next rollout."""
+        """Set action noise and step size of the next iteration."""
         std = piecewise_linear(self.config.ppo.action_std, self.progress)
         self.actor.distribution.std_param.fill_(std)
+        self.desired_kl = piecewise_linear(self.config.ppo.desired_kl, self.progress)
 
     # --- skills ---------------------------------------------------------------------------------
 
