@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import torch
 
-from kiras_rl.config import Config, ConfigError
+from kiras_rl.config import ConfigError
 from kiras_rl.envs.quadruped import QuadrupedEnv
 from kiras_rl.robots.robot import load_robot
+from kiras_rl.schema import Config
 
 BACKENDS = ("auto", "native", "warp")
 

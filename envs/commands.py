@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import torch
 
-from kiras_rl.config import CommandConfig, SkillConfig
 from kiras_rl.envs.randomness import UniformBuffer, scale_to
 from kiras_rl.envs.state import Task
+from kiras_rl.schema import CommandConfig, SkillConfig
 
 COLUMNS = {
     "command": 3,

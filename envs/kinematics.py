@@ -1,8 +1,15 @@
-"""Forward kinematics of the feet for whole batches: where to put the base at a reset."""
+"""Forward kinematics of the feet for whole batches: how high they are, where a reset puts the base.
+
+Computed here and not by the simulation, which would have to go through all of its position stage
+again after resets.
+"""
 
 from __future__ import annotations
 
+import itertools
+
 import mujoco
+import numpy as np
 import torch
 
 from kiras_rl.robots.robot import Robot
@@ -11,20 +18,20 @@ from kiras_rl.robots.robot import Robot
 class FootKinematics:
     """Chains of hinges from the base to each foot; all chains have the same length.
 
+    A hinge turns a vector v into a (a.v) + cos(q) (v - a (a.v)) + sin(q) a x v (Rodrigues), so a
+    foot's position is linear in the products of (1, cos, sin) over its joints. The coefficients are
+    computed once: what remains each step is one matrix product.
+
     Letters: F feet, L links of a chain, J joints.
     """
 
     def __init__(self, model: mujoco.MjModel, robot: Robot, device: torch.device) -> None:
         """Read the chains from the compiled model."""
         chains = [_chain(model, robot, foot) for foot in robot.foot_geoms]
-
-        def stack(key: str, dtype: torch.dtype) -> torch.Tensor:
-            return torch.tensor([c[key] for c in chains], dtype=dtype, device=device)
-
-        self._joints = stack("joints", torch.int64)  # (F, L)
-        self._axes = stack("axes", torch.float32)  # (F, L, 3)
-        self._offsets = stack("offsets", torch.float32)  # (F, L, 3), in the parent link
-        self._feet = stack("foot", torch.float32)  # (F, 3), in the last link
+        factors = [_factors(chain["joints"], len(robot.joint_names)) for chain in chains]
+        self._factors = torch.tensor(np.concatenate(factors, axis=1), device=device)  # (L, F 3^L)
+        coefficients = [torch.tensor(_coefficients(chain), device=device) for chain in chains]
+        self._coefficients = torch.block_diag(*coefficients).float()  # (F 3^L, F 3)
         self._radius = robot.foot_radius
 
     def foot_pos_b(self, joint_pos: torch.Tensor) -> torch.Tensor:
@@ -33,11 +40,21 @@ class FootKinematics:
         Args:
             joint_pos: Joint angles, (N, J), rad.
         """
-        pos = self._feet.expand(len(joint_pos), -1, -1)
-        for link in reversed(range(self._joints.shape[1])):
-            angle = joint_pos[:, self._joints[:, link]].unsqueeze(-1)  # (N, F, 1)
-            pos = self._offsets[:, link] + _rotate(self._axes[:, link], angle, pos)
-        return pos
+        one = torch.ones_like(joint_pos[:, :1])
+        turns = torch.cat([one, joint_pos.cos(), joint_pos.sin()], dim=1)
+        products = turns.index_select(1, self._factors[0])
+        for columns in self._factors[1:]:
+            products = products * turns.index_select(1, columns)
+        return (products @ self._coefficients).unflatten(1, (-1, 3))
+
+    def foot_height_b(self, gravity_b: torch.Tensor, joint_pos: torch.Tensor) -> torch.Tensor:
+        """Return the height of each foot's lowest point above the base, (N, F), m.
+
+        Args:
+            gravity_b: Unit vector of gravity in the base frame, (N, 3).
+            joint_pos: Joint angles, (N, J), rad.
+        """
+        return -(gravity_b[:, None] * self.foot_pos_b(joint_pos)).sum(-1) - self._radius
 
     def lowest_foot(self, pitch: torch.Tensor, joint_pos: torch.Tensor) -> torch.Tensor:
         """Return the height of the lowest foot below a base pitched by (N,) rad, (N,), m."""
@@ -60,9 +77,17 @@ def _chain(model: mujoco.MjModel, robot: Robot, foot: str) -> dict[str, list]:
     return chain
 
 
-def _rotate(axis: torch.Tensor, angle: torch.Tensor, vector: torch.Tensor) -> torch.Tensor:
-    """Rotate (N, F, 3) about unit axes (F, 3) by (N, F, 1) rad (Rodrigues)."""
-    axis = axis.expand_as(vector)
-    along = axis * (axis * vector).sum(-1, keepdim=True)
-    across = torch.linalg.cross(axis, vector)
-    return along + torch.cos(angle) * (vector - along) + torch.sin(angle) * across
+def _factors(joints: list[int], num_joints: int) -> np.ndarray:
+    """Return the columns of (1, cos, sin of every joint) that make the products, (L, 3^L)."""
+    choices = [(0, 1 + joint, 1 + num_joints + joint) for joint in joints]
+    return np.array(list(itertools.product(*choices))).T
+
+
+def _coefficients(chain: dict[str, list]) -> np.ndarray:
+    """Return what each product adds to the position of the foot, (3^L, 3), m."""
+    terms = np.array([chain["foot"]])
+    for axis, offset in zip(reversed(chain["axes"]), reversed(chain["offsets"]), strict=True):
+        along = np.outer(terms @ axis, axis)
+        terms = np.concatenate([along, terms - along, np.cross(axis, terms)])
+        terms[0] += offset
+    return terms

@@ -18,15 +18,13 @@ class SensorLayout:
     """Where each quantity lies in `sensordata`; a slice spans all feet, joints or geoms.
 
     Attributes:
-        foot_pos_w: Centres of the foot spheres, F * 3, m.
-        foot_vel_w: Velocities of those centres, F * 3, m/s.
+        foot_vel_w: Velocities of the centres of the foot spheres, F * 3, m/s.
         foot_force_w: Net contact force of each foot on the ground, F * 3, N.
         base_force_w: The same for the geoms of the base, B * 3, N.
         limb_force_w: The same for the penalised geoms, L * 3, N.
         joint_torque: Actuator torques, J, N m.
     """
 
-    foot_pos_w: slice
     foot_vel_w: slice
     foot_force_w: slice
     base_force_w: slice
@@ -84,7 +82,6 @@ def _add_sensors(spec: mujoco.MjSpec, robot: Robot) -> dict[str, list[str]]:
 
     contact, geom = _SENSOR.mjSENS_CONTACT, _OBJ.mjOBJ_GEOM
     return {
-        "foot_pos_w": add("pos", _SENSOR.mjSENS_FRAMEPOS, geom, robot.foot_geoms),
         "foot_vel_w": add("vel", _SENSOR.mjSENS_FRAMELINVEL, geom, robot.foot_geoms),
         "foot_force_w": add("foot", contact, geom, robot.foot_geoms),
         "base_force_w": add("base", contact, geom, robot.base_geoms),

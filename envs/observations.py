@@ -155,6 +155,8 @@ class ObservationGroup:
 
 def _check_keys(terms: dict, where: str) -> None:
     for name, values in terms.items():
+        if not isinstance(values, dict):
+            raise ConfigError(f"{where}.{name}: give scale and noise, as in {name}: {{scale: 1.0}}")
         unknown = set(values) - {"scale", "noise"}
         if unknown:
             raise ConfigError(

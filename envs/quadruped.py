@@ -8,15 +8,15 @@ import time
 import mujoco
 import torch
 from tensordict import TensorDict
-from torch.nn.functional import one_hot
 
 from kiras_rl import interfaces as names
-from kiras_rl.config import EnvConfig, SimConfig
 from kiras_rl.envs import commands, randomization, rotations, terminations
 from kiras_rl.envs.commands import TaskSampler
+from kiras_rl.envs.description import describe_deployment
 from kiras_rl.envs.kinematics import FootKinematics
 from kiras_rl.envs.model import Scene, build_scene
-from kiras_rl.envs.observations import ObservationGroup, View
+from kiras_rl.envs.observations import View
+from kiras_rl.envs.observer import NOISE, Observer
 from kiras_rl.envs.randomization import Randomizer
 from kiras_rl.envs.randomness import UniformBuffer, scale_to
 from kiras_rl.envs.rewards import RewardSum
@@ -24,6 +24,7 @@ from kiras_rl.envs.simulation.base import Simulation
 from kiras_rl.envs.state import Keyframes, RobotState, Step, Task
 from kiras_rl.interfaces import Measurements, SkillEnv
 from kiras_rl.robots.robot import Robot
+from kiras_rl.schema import EnvConfig, SimConfig
 
 SPAWN_CLEARANCE = 0.002  # m between the lowest foot and the ground at a reset
 KEYFRAME_COMMANDS = (0.0, 0.4, 0.8)  # of the largest v_x, for the value of a skill
@@ -76,21 +77,18 @@ class QuadrupedEnv(SkillEnv):
         self._last_joint_vel = torch.zeros(n, self.num_actions, device=device)
         self._last_joint_torque = torch.zeros(n, self.num_actions, device=device)
         self._measurements: Measurements | None = None
-        self.robot = RobotState(self.sim, self._scene.sensors, robot)
         self._kinematics = FootKinematics(self._scene.model, robot, device)
+        self.robot = RobotState(self.sim, self._scene.sensors, self._kinematics)
 
     def _build_terms(self, seed: int) -> None:
-        cfg, view = self.cfg, self._view()
-        groups = cfg.observations
-        self.proprio = ObservationGroup("proprio", groups.proprio, view)
-        self.critic = ObservationGroup("critic", groups.critic, view)
-        self.imitation = ObservationGroup("imitation", groups.imitation, view)
+        cfg = self.cfg
+        self._observer = Observer(cfg.observations, self._view())
         self.keyframe_features = self._features_of_keyframes()
-        self.feature_noise = self.imitation.noise
+        self.feature_noise = self._observer.imitation.noise
         self._rewards = RewardSum(cfg.rewards, self.step_dt, self.device)
         generator = torch.Generator(device=self.device)
         generator.manual_seed(seed)
-        columns = {"joint": self.num_actions, "velocity": 2, "noise": self.proprio.size}
+        columns = {"joint": self.num_actions, "velocity": 2, NOISE: self._observer.proprio.size}
         columns |= commands.COLUMNS | randomization.COLUMNS
         self._random = UniformBuffer(self.num_envs, columns, generator)
         self._tasks = TaskSampler(
@@ -99,9 +97,6 @@ class QuadrupedEnv(SkillEnv):
         self._randomizer = Randomizer(cfg.randomization, self._scene, self.sim, self._random)
 
     def _begin(self) -> None:
-        size = self.proprio.size
-        self._proprio = torch.zeros(self.num_envs, size, device=self.device)
-        self._history = self._proprio.repeat(1, self.cfg.observations.history_length)
         self.reset()
         if self.cfg.terminations.random_first_length:
             # Otherwise all worlds time out together, and the data of a rollout is all alike.
@@ -118,7 +113,7 @@ class QuadrupedEnv(SkillEnv):
         The order: act, simulate, judge (terminations, rewards, imitation features: all of the
         motion that just happened), then choose what comes next (tasks, resets, pushes), and
         observe. What is judged is never touched by a reset, and what is observed is never older
-        than the reset.
+        than the reset: it follows from positions and velocities, which every write renews.
 
         Args:
             actions: Unscaled joint targets around q0, (N, J).
@@ -134,7 +129,7 @@ class QuadrupedEnv(SkillEnv):
         begin = time.perf_counter()
         self.sim.step(self._joint_targets(self._action))
         self._physics_time = time.perf_counter() - begin
-        self._length += 1
+        self._length = self._length + 1
         self.robot.read_step()
         self._random.refill()
 
@@ -142,12 +137,12 @@ class QuadrupedEnv(SkillEnv):
         fallen = self._fallen() | invalid
         time_outs = (self._length >= self.max_episode_length) & ~fallen
         terms = self._judge(last_action, fallen, invalid)
-        view = self._view()
+        observer, view = self._observer, self._view()
         extras = {
             names.EXTRA_TIME_OUTS: time_outs,
-            names.EXTRA_IMITATION: self._unless(invalid, self.imitation(view), self._features),
+            names.EXTRA_IMITATION: _unless(invalid, observer.imitation(view), observer.features),
             names.EXTRA_VALID: ~invalid,
-            names.NEXT_PROPRIO: self._unless(invalid, self.proprio(view), self._clean),
+            names.NEXT_PROPRIO: _unless(invalid, observer.proprio(view), observer.clean),
             "log": self._log(terms, fallen, time_outs),
         }
         self._measurements = self._measure(fallen)
@@ -198,7 +193,6 @@ class QuadrupedEnv(SkillEnv):
         qvel = self.sim.qvel.clone()
         qvel[:, :2] += velocity
         self.sim.write_velocity(push & ~done, qvel)
-        self.sim.forward()
         self.robot.read_kinematics()
         self._last_joint_vel = self.robot.joint_vel.clone()
 
@@ -236,35 +230,7 @@ class QuadrupedEnv(SkillEnv):
         return View(self.robot, self.task, self.keyframes, self._default_joint_pos, self._action)
 
     def _observe(self, begun: torch.Tensor) -> TensorDict:
-        """Return the observation; worlds that have just `begun` (N,) get a fresh history."""
-        view, frames = self._view(), self.cfg.observations.history_length
-        self._clean, self._features = self.proprio(view), self.imitation(view)
-        proprio = self._with_noise(self._clean)
-        size = self.proprio.size
-        shifted = torch.cat([self._history[:, size:], self._proprio], dim=1)
-        self._history = torch.where(begun[:, None], proprio.repeat(1, frames), shifted)
-        self._proprio = proprio
-        groups = {
-            names.PROPRIO: proprio,
-            names.HISTORY: self._history,
-            names.CRITIC: torch.cat([self._clean, self.critic(view)], dim=1),
-            names.IMITATION: self._features,
-            names.VELOCITY: self.robot.base_lin_vel_b,
-            names.SKILL: one_hot(self.task.skill, len(self.skills)).float(),
-            names.COMMAND: self.task.command,
-        }
-        self._observation = TensorDict(groups, batch_size=[self.num_envs], device=self.device)
-        return self._observation
-
-    def _with_noise(self, clean: torch.Tensor) -> torch.Tensor:
-        if not self.cfg.observations.noise:
-            return clean
-        return clean + self.proprio.noise * scale_to(self._random["noise"], -1.0, 1.0)
-
-    @staticmethod
-    def _unless(mask: torch.Tensor, new: torch.Tensor, old: torch.Tensor) -> torch.Tensor:
-        """Return `new` (N, k), with `old` in the masked worlds."""
-        return torch.where(mask[:, None], old, new)
+        return self._observer.observe(self._view(), begun, self._random)
 
     def _measure(self, fallen: torch.Tensor) -> Measurements:
         robot = self.robot
@@ -296,7 +262,7 @@ class QuadrupedEnv(SkillEnv):
 
     def get_observations(self) -> TensorDict:
         """Return the observation of the last step or reset."""
-        return self._observation
+        return self._observer.observation
 
     @property
     def episode_length_buf(self) -> torch.Tensor:
@@ -323,7 +289,6 @@ class QuadrupedEnv(SkillEnv):
         command = task.command if command is None else command
         self.task = Task(command=command.clone(), skill=skill.clone(), start=start.clone())
         self._reset_worlds(self._all, self.task.start)
-        self.sim.forward()
         self.robot.read_kinematics()
         self._last_joint_vel = self.robot.joint_vel.clone()
         return self._observe(self._all)
@@ -332,17 +297,7 @@ class QuadrupedEnv(SkillEnv):
         """Give every world a new skill and command, which stay until the next call."""
         self._held = True
         self.task = Task(command=command.clone(), skill=skill.clone(), start=self.task.start)
-        view = self._view()
-        clean = self.proprio(view)
-        self._proprio = self._proprio + clean - self._clean  # the same noise, the new task
-        self._clean, self._features = clean, self.imitation(view)
-        self._observation = self._observation.clone()
-        self._observation[names.PROPRIO] = self._proprio
-        self._observation[names.CRITIC] = torch.cat([clean, self.critic(view)], dim=1)
-        self._observation[names.IMITATION] = self._features
-        self._observation[names.SKILL] = one_hot(skill, len(self.skills)).float()
-        self._observation[names.COMMAND] = self.task.command
-        return self._observation
+        return self._observer.change_task(self._view())
 
     def set_skill_probabilities(self, probabilities: torch.Tensor) -> None:
         """Set the probabilities with which new skills are drawn, (S,)."""
@@ -355,7 +310,7 @@ class QuadrupedEnv(SkillEnv):
     def _features_of_keyframes(self) -> torch.Tensor:
         """Return Phi in each keyframe at rest, (S, D)."""
         skills = torch.arange(len(self.skills), device=self.device)
-        return self.imitation(self._at_rest(skills, torch.zeros(len(skills), 3)))
+        return self._observer.imitation(self._at_rest(skills, torch.zeros(len(skills), 3)))
 
     def keyframe_observations(self) -> torch.Tensor:
         """Return critic observations at rest in each keyframe for G commands, (S, G, C)."""
@@ -365,7 +320,7 @@ class QuadrupedEnv(SkillEnv):
         largest = self.cfg.commands.lin_vel_x[1]
         command[:, 0] = largest * torch.tensor(KEYFRAME_COMMANDS, device=self.device).repeat(count)
         view = self._at_rest(skills, command)
-        return torch.cat([self.proprio(view), self.critic(view)], dim=1).unflatten(0, (count, grid))
+        return self._observer.privileged(view).unflatten(0, (count, grid))
 
     def _at_rest(self, skill: torch.Tensor, command: torch.Tensor) -> View:
         robot = RobotState.at_rest(self.keyframes, skill, len(self.robot_cfg.foot_geoms))
@@ -375,33 +330,7 @@ class QuadrupedEnv(SkillEnv):
 
     def describe(self) -> dict:
         """Return the deployment contract of a policy trained here."""
-        robot, proprio, ranges = self.robot_cfg, self.proprio, self.cfg.commands
-        terms = zip(proprio.names, proprio.sizes, proprio.scales, strict=True)
-        return {
-            "robot": robot.name,
-            "joint_names": list(robot.joint_names),
-            **{
-                name: getattr(robot, name).tolist()
-                for name in ("default_joint_pos", "kp", "kd", "torque_limit", "action_scale")
-            },
-            "action_clip": self.cfg.action_clip,
-            "observation": [{"name": n, "size": k, "scale": x} for n, k, x in terms],
-            "history_length": self.cfg.observations.history_length,
-            "skills": list(self.skills),
-            "keyframes": {
-                k.name: {
-                    "base_height": k.base_height,
-                    "pitch": k.pitch,
-                    "joint_pos": k.joint_pos.tolist(),
-                }
-                for k in robot.keyframes
-            },
-            "control_rate": 1.0 / self.step_dt,
-            "command_range": {
-                name: list(getattr(ranges, name))
-                for name in ("lin_vel_x", "lin_vel_y", "ang_vel_z")
-            },
-        }
+        return describe_deployment(self.robot_cfg, self.cfg, self._observer.proprio, self.step_dt)
 
     def state_dict(self) -> dict:
         """Return all that the next steps depend on, for an exact resume."""
@@ -411,7 +340,7 @@ class QuadrupedEnv(SkillEnv):
             "held": self._held,
             "probabilities": self._tasks.probabilities,
             "generator": self._random.generator.get_state(),
-            "observation": self._observation.to_dict(),
+            "observer": self._observer.state_dict(),
             "buffers": {name: getattr(self, name) for name in _BUFFERS},
         }
 
@@ -424,9 +353,7 @@ class QuadrupedEnv(SkillEnv):
         self._random.generator.set_state(state["generator"].cpu())
         for name in _BUFFERS:
             setattr(self, name, state["buffers"][name].to(self.device))
-        self._observation = TensorDict(
-            state["observation"], batch_size=[self.num_envs], device=self.device
-        )
+        self._observer.load_state_dict(state["observer"])
         self.robot.read_kinematics()
 
 
@@ -435,11 +362,12 @@ _BUFFERS = (
     "_action",
     "_last_joint_vel",
     "_last_joint_torque",
-    "_history",
-    "_proprio",
-    "_clean",
-    "_features",
 )
+
+
+def _unless(mask: torch.Tensor, new: torch.Tensor, old: torch.Tensor) -> torch.Tensor:
+    """Return `new` (N, k), with `old` in the masked worlds (N,)."""
+    return torch.where(mask[:, None], old, new)
 
 
 def _build_scene(robot: Robot, sim_cfg: SimConfig, cfg: EnvConfig) -> Scene:

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import torch
 
-from kiras_rl.config import RandomizationConfig
 from kiras_rl.envs.model import Scene
 from kiras_rl.envs.randomness import UniformBuffer, scale_to
 from kiras_rl.envs.simulation.base import Simulation
+from kiras_rl.schema import RandomizationConfig
 
 COLUMNS = {
     "friction": 1,

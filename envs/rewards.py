@@ -1,7 +1,7 @@
 """Reward terms: one pure function each, (Step, parameters of the YAML) -> (N,).
 
-A term's value is positive; its weight in the YAML gives the sign. The paper's table is
-cfg/paper.yaml.
+A term's value is positive and its weight in the YAML gives the sign; only `feet_drag` is negative,
+for the paper gives it a positive weight. The paper's table is cfg/paper.yaml.
 """
 
 from __future__ import annotations
@@ -12,9 +12,10 @@ from functools import partial
 
 import torch
 
-from kiras_rl.config import ConfigError, RewardConfig
+from kiras_rl.config import ConfigError
 from kiras_rl.envs.lookup import find_function
 from kiras_rl.envs.state import Step
+from kiras_rl.schema import RewardConfig
 
 STANDING = 0.1  # m/s or rad/s; a smaller command asks to stand
 
@@ -145,6 +146,11 @@ class RewardSum:
             ConfigError: Unknown term or parameter.
         """
         terms = {name: values for name, values in config.terms.items() if values is not None}
+        for name, values in terms.items():
+            if not isinstance(values, dict):
+                raise ConfigError(
+                    f"env.rewards.terms.{name}: give a weight, as in {name}: {{weight: 1.0}}"
+                )
         self.names = list(terms)
         self.is_termination = torch.tensor([n == "termination" for n in terms], device=device)
         self._terms = [_bind(name, values) for name, values in terms.items()]

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import torch
 
 from kiras_rl.envs import rotations
+from kiras_rl.envs.kinematics import FootKinematics
 from kiras_rl.envs.model import SensorLayout
 from kiras_rl.envs.simulation.base import Simulation
 from kiras_rl.robots.robot import Robot
@@ -22,15 +23,14 @@ class RobotState:
     """Named quantities of N robots with J joints, F feet, L other penalised geoms.
 
     `read_step` fills everything after a control step; `read_kinematics` renews what a reset or a
-    push changed. Contacts and torques keep the values of the step.
+    push changed. Contacts, velocities of the feet and torques keep the values of the step.
     """
 
-    def __init__(self, sim: Simulation, layout: SensorLayout, robot: Robot) -> None:
+    def __init__(self, sim: Simulation, layout: SensorLayout, kinematics: FootKinematics) -> None:
         """Bind to a simulation."""
         self._sim = sim
         self._layout = layout
-        self._foot_radius = robot.foot_radius
-        self._num_feet = len(robot.foot_geoms)
+        self._kinematics = kinematics
         self.read_kinematics()
         self._read_contacts()
 
@@ -48,22 +48,16 @@ class RobotState:
         robot.roll_pitch = rotations.roll_pitch(robot.gravity_b)
         robot.joint_pos = keyframes.joint_pos[skill]
         robot.joint_vel = torch.zeros_like(robot.joint_pos)
-        robot.foot_height = torch.zeros(len(skill), num_feet, device=skill.device)
+        robot._foot_height = torch.zeros(len(skill), num_feet, device=skill.device)
         return robot
 
     def read_step(self) -> None:
         """Read everything after a control step."""
-        self._read_base()
+        self.read_kinematics()
         self._read_contacts()
 
     def read_kinematics(self) -> None:
-        """Read the state and the position sensors after `Simulation.forward`."""
-        self._read_base()
-        # Height of the lowest point of each foot above the ground, (N, F), m
-        pos = self._sim.sensors[:, self._layout.foot_pos_w].unflatten(1, (self._num_feet, 3))
-        self.foot_height = pos[..., 2] - self._foot_radius
-
-    def _read_base(self) -> None:
+        """Read what follows from positions and velocities alone."""
         qpos, qvel = self._sim.qpos, self._sim.qvel
         self.base_pos_w = qpos[:, :3]  # (N, 3), m
         self.base_height = qpos[:, 2]  # above the ground under the base, (N,), m
@@ -77,6 +71,15 @@ class RobotState:
         self.yaw_rate = -(self.gravity_b * self.base_ang_vel_b).sum(-1)
         self.joint_pos = qpos[:, 7:]  # (N, J), rad
         self.joint_vel = qvel[:, 6:]  # (N, J), rad/s
+        self._foot_height: torch.Tensor | None = None
+
+    @property
+    def foot_height(self) -> torch.Tensor:
+        """Height of the lowest point of each foot above the ground, (N, F), m."""
+        if self._foot_height is None:  # not every step asks for it
+            below = self._kinematics.foot_height_b(self.gravity_b, self.joint_pos)
+            self._foot_height = self.base_height[:, None] + below
+        return self._foot_height
 
     def _read_contacts(self) -> None:
         record, layout = self._sim.sensor_record, self._layout
@@ -147,11 +150,12 @@ class Step:
         task: Their tasks.
         keyframes: The skills.
         action: Clipped action of this step, (N, J).
-        last_action: Clipped action of the step before, (N, J).
+        last_action: Clipped action of the step before, (N, J); in the first step of an episode the
+            one that holds the start pose.
         last_joint_vel: Before the step, (N, J), rad/s.
         last_joint_torque: Before the step, (N, J), N m.
-        fresh: Worlds in the first step of an episode, (N,) bool; differences to the step before
-            are zero there.
+        fresh: Worlds in the first step of an episode, (N,) bool; `delta_torques` is zero there,
+            for there is no torque of a step before.
         fallen: Worlds that terminate by failure, (N,) bool.
         dt: Duration of the step, s.
     """
@@ -170,9 +174,15 @@ class Step:
 
 def _force(flat: torch.Tensor) -> torch.Tensor:
     """Return magnitudes of the forces in (..., 3 G), as (..., G)."""
-    return torch.linalg.vector_norm(flat.unflatten(-1, (-1, 3)), dim=-1)
+    return _squared_force(flat).sqrt()
 
 
 def _peak_force(record: torch.Tensor) -> torch.Tensor:
     """Return the largest magnitude over the physics steps of (N, K, 3 G), as (N, G)."""
-    return _force(record).amax(dim=1)
+    return _squared_force(record).amax(dim=1).sqrt()
+
+
+def _squared_force(flat: torch.Tensor) -> torch.Tensor:
+    # Written out: a CPU takes several times as long to reduce over three numbers.
+    x, y, z = flat.unflatten(-1, (-1, 3)).unbind(-1)
+    return x * x + y * y + z * z

@@ -1,18 +1,15 @@
-"""Configurations: typed here, valued in cfg/base.yaml, narrowed by `extends` and `key=value`.
-
-The dataclasses below name and type every key and hold no default: a value stands in one place,
-cfg/base.yaml, with its unit and source.
-"""
+"""Reading configurations: cfg/base.yaml, narrowed by `extends` and `key=value`."""
 
 from __future__ import annotations
 
 import difflib
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
+
+from kiras_rl.ranges import find_mistake
+from kiras_rl.schema import Config
 
 CFG_FOLDER = Path(__file__).resolve().parent / "cfg"
 if not CFG_FOLDER.is_dir():  # an editable install: kiras_rl.cfg is the top-level folder cfg/
@@ -24,222 +21,6 @@ RESUME_OVERRIDES = ("iterations", "device", "sim.threads", "checkpoint_minutes")
 
 class ConfigError(ValueError):
     """A configuration that cannot be used: says what was given and what is allowed."""
-
-
-@dataclass
-class SimConfig:
-    """Physics."""
-
-    backend: str
-    threads: int
-    timestep: float
-    substeps: int
-    solver_iterations: int
-    max_contacts: int
-    max_constraints: int
-
-
-@dataclass
-class ObservationConfig:
-    """Observation groups: term name -> {scale, noise}; null removes a term."""
-
-    history_length: int
-    noise: bool
-    proprio: dict[str, Any]
-    critic: dict[str, Any]
-    imitation: dict[str, Any]
-
-
-@dataclass
-class RewardConfig:
-    """Task reward: term name -> {weight, parameters of the term}; null removes a term."""
-
-    scale_by_dt: bool
-    terms: dict[str, Any]
-
-
-@dataclass
-class CommandConfig:
-    """Velocity commands in the heading frame."""
-
-    lin_vel_x: tuple[float, float]
-    lin_vel_y: tuple[float, float]
-    ang_vel_z: tuple[float, float]
-    zero_probability: float
-    resample_probability: float
-
-
-@dataclass
-class SkillConfig:
-    """Which skill a world is asked for, and where its episodes start."""
-
-    switch_probability: float
-    start_at_target: float
-    joint_noise: float
-    velocity_noise: float
-
-
-@dataclass
-class TerminationConfig:
-    """Ends of an episode."""
-
-    episode_length: float
-    random_first_length: bool
-    base_contact_force: float
-    max_tilt: float
-
-
-@dataclass
-class RandomizationConfig:
-    """Domain randomization; null leaves the nominal value."""
-
-    friction: tuple[float, float] | None
-    payload: tuple[float, float] | None
-    com_shift: tuple[float, float] | None
-    kp_factor: tuple[float, float] | None
-    kd_factor: tuple[float, float] | None
-    action_delay: tuple[int, int] | None
-    push_velocity: tuple[float, float] | None
-    push_interval: float
-
-
-@dataclass
-class EnvConfig:
-    """The Markov decision process."""
-
-    action_clip: float
-    observations: ObservationConfig
-    rewards: RewardConfig
-    commands: CommandConfig
-    skills: SkillConfig
-    terminations: TerminationConfig
-    randomization: RandomizationConfig
-
-
-@dataclass
-class DiscriminatorConfig:
-    """LSGAN discriminator of pairs of Phi."""
-
-    hidden_dims: list[int]
-    learning_rate: float
-    updates: int
-    batch_size: int
-    gradient_penalty: float
-    noise: list[list[float]]
-
-
-@dataclass
-class PremiumConfig:
-    """Premium trajectory selector."""
-
-    rule: str
-    window: int
-    capacity: int
-    max_age: int
-    min_command: float
-    max_distance: float
-    per_iteration: int
-    keyframe_share: float
-    distance_weight: float
-
-
-@dataclass
-class ImitationConfig:
-    """Self-imitation learning."""
-
-    reward_weight: float
-    discriminator: DiscriminatorConfig
-    premium: PremiumConfig
-
-
-@dataclass
-class MultiCriticConfig:
-    """Two critics and the schedule that mixes their advantages."""
-
-    sigma: float
-    omega2_floor: float
-    std_floor: float
-
-
-@dataclass
-class EstimatorConfig:
-    """Environment context estimator with AdaBoot."""
-
-    latent_dim: int
-    encoder_dims: list[int]
-    decoder_dims: list[int]
-    learning_rate: float
-    epochs: int
-    kl_weight: float
-    prior_weight: float
-    adaboot: str
-    adaboot_floor: float
-
-
-@dataclass
-class SkillInitConfig:
-    """Skill Initialization."""
-
-    floor: float
-    smoothing: float
-
-
-@dataclass
-class PPOConfig:
-    """Proximal policy optimisation."""
-
-    num_steps: int
-    num_epochs: int
-    num_mini_batches: int
-    gamma: float
-    lam: float
-    clip_param: float
-    value_loss_coef: float
-    max_grad_norm: float
-    learning_rate: float
-    learning_rate_range: tuple[float, float]
-    desired_kl: list[list[float]]
-    action_std: list[list[float]]
-    actor_dims: list[int]
-    critic_dims: list[int]
-    only_positive_rewards: bool
-
-
-@dataclass
-class LearnerConfig:
-    """The learner; a null block removes that part of KiRAS."""
-
-    ppo: PPOConfig
-    imitation: ImitationConfig | None
-    multi_critic: MultiCriticConfig | None
-    estimator: EstimatorConfig | None
-    skill_init: SkillInitConfig | None
-
-
-@dataclass
-class EvaluationConfig:
-    """The deterministic evaluation beside the training."""
-
-    interval: int
-    worlds_per_skill: int
-    duration: float
-    command: float
-
-
-@dataclass
-class Config:
-    """Everything that defines a run."""
-
-    robot: str
-    seed: int
-    device: str
-    num_envs: int
-    iterations: int
-    checkpoint_minutes: float
-    sim: SimConfig
-    env: EnvConfig
-    learner: LearnerConfig
-    evaluation: EvaluationConfig
 
 
 def load_config(name: str, overrides: list[str] | tuple[str, ...] = ()) -> Config:
@@ -309,9 +90,8 @@ def _resolve(layers: list[dict], overrides: list[str], source: str) -> Config:
     if missing:
         raise ConfigError(f"{source} leaves out: {', '.join(missing)}; extend base or set them")
     assert isinstance(result, Config)
-    for key in ("num_envs", "iterations"):
-        if getattr(result, key) < 1:
-            raise ConfigError(f"{key}={getattr(result, key)}: at least 1")
+    if mistake := find_mistake(config_to_dict(result)):
+        raise ConfigError(mistake)
     return result
 
 

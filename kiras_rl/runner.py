@@ -17,10 +17,11 @@ from torch.utils.tensorboard import SummaryWriter
 
 from kiras_rl import __version__, checkpoint
 from kiras_rl.algorithms.kiras import KirasPPO
-from kiras_rl.config import Config, config_to_dict
+from kiras_rl.config import config_to_dict
 from kiras_rl.deploy.metadata import FORMAT as METADATA_FORMAT
 from kiras_rl.evaluation import Policy, SkillResult, as_scalars, score
 from kiras_rl.interfaces import SkillEnv
+from kiras_rl.schema import Config
 
 Evaluate = Callable[[Policy], dict[str, SkillResult]]
 
@@ -254,12 +255,12 @@ class KirasRunner(OnPolicyRunner):
             "generators": _generator_states(),
             "policy": policy.state_dict(),
             "policy_shape": policy.shape(),
-            "description": self._describe_policy(),
+            "description": self.describe_policy(),
             "infos": infos,
         }
         checkpoint.save_checkpoint(Path(path), content)
 
-    def _describe_policy(self) -> dict:
+    def describe_policy(self) -> dict:
         """Return the policy's metadata with where it comes from."""
         steps = self.env.num_envs * self.cfg["num_steps_per_env"] * self.current_learning_iteration
         provenance = {

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from kiras_rl.config import SkillInitConfig
+from kiras_rl.schema import SkillInitConfig
 
 
 def skill_probabilities(values: torch.Tensor, floor: float) -> torch.Tensor:

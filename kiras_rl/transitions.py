@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import torch
 
-from kiras_rl.evaluation import SEED, Policy
+from kiras_rl.evaluation import SEED, Policy, moving_average
 from kiras_rl.interfaces import SkillEnv
 
 BEFORE = 2.0  # s of walking in the first skill
@@ -24,7 +24,8 @@ class Transitions:
 
     Attributes:
         fell: Share of trials with a fall, (S, S).
-        settled: Share of trials without a fall that settled within LIMIT, (S, S).
+        settled: Share of trials that were in the first skill before the switch, did not fall, and
+            settled in the second within LIMIT, (S, S).
         settle_time: Mean time to settle of those that did, (S, S), s.
         trials: Trials of each pair.
     """
@@ -74,19 +75,30 @@ def evaluate_transitions(env: SkillEnv, policy: Policy, trials: int, command: fl
     env.seed(SEED)
     obs = env.reset(first, commands)
     alive = torch.ones(env.num_envs, dtype=torch.bool, device=env.device)
-    within = []
+    switch = round(BEFORE / env.step_dt)
+    heights, pitches = [], []
     for step in range(round((BEFORE + AFTER) / env.step_dt)):
-        if step == round(BEFORE / env.step_dt):
+        if step == switch:
             obs = env.set_task(second, commands)
         obs = env.step(policy(obs))[0]
         now = env.measure()
         alive &= ~now.fallen
-        height_error = (now.base_height - env.keyframe_height[second]).abs()
-        pitch_error = (now.pitch - env.keyframe_pitch[second]).abs()
-        within.append((height_error < HEIGHT_BAND) & (pitch_error < PITCH_BAND))
-    after = torch.stack(within[round(BEFORE / env.step_dt) :])
-    time = settle_times(after, env.step_dt)
+        heights.append(now.base_height)
+        pitches.append(now.pitch)
+    height = moving_average(torch.stack(heights), env.step_dt)
+    pitch = moving_average(torch.stack(pitches), env.step_dt)
+    began = _within(env, first, height[switch - 1 : switch], pitch[switch - 1 : switch])[0]
+    time = settle_times(_within(env, second, height[switch:], pitch[switch:]), env.step_dt)
+    time = torch.where(began, time, torch.inf)
     return _collect(first.cpu(), second.cpu(), alive.cpu(), time.cpu(), count, trials)
+
+
+def _within(
+    env: SkillEnv, skill: torch.Tensor, height: torch.Tensor, pitch: torch.Tensor
+) -> torch.Tensor:
+    """Return whether heights and pitches (T, N) lie in the bands around the keyframes, (T, N)."""
+    near = (height - env.keyframe_height[skill]).abs() < HEIGHT_BAND
+    return near & ((pitch - env.keyframe_pitch[skill]).abs() < PITCH_BAND)
 
 
 def settle_times(within: torch.Tensor, step_dt: float) -> torch.Tensor:

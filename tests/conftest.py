@@ -31,6 +31,19 @@ def pytest_runtest_setup(item):
 
 
 @pytest.fixture(scope="session")
+def build_env():
+    """Return a function that builds an environment on C MuJoCo, with overrides."""
+    from kiras_rl.config import load_config
+    from kiras_rl.envs import make_env
+
+    def build(*overrides, cfg="solo8", num_envs=8):
+        shape = [f"num_envs={num_envs}", "device=cpu", "sim.backend=native"]
+        return make_env(load_config(cfg, [*shape, *overrides]))
+
+    return build
+
+
+@pytest.fixture(scope="session")
 def make_metadata():
     """Describe a policy of Solo-8 that observes every term a robot can rebuild."""
     from kiras_rl.deploy.metadata import PolicyMetadata

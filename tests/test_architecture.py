@@ -27,7 +27,13 @@ LEARNING = Rule(
 SIMULATION = Rule(
     (
         *("torch", "tensordict", "numpy", "mujoco"),
-        *("kiras_rl.envs", "kiras_rl.robots", "kiras_rl.interfaces", "kiras_rl.config"),
+        *(
+            "kiras_rl.envs",
+            "kiras_rl.robots",
+            "kiras_rl.interfaces",
+            "kiras_rl.config",
+            "kiras_rl.schema",
+        ),
     )
 )
 ANYTHING = Rule(("",))

@@ -14,6 +14,7 @@ from kiras_rl.config import (
     save_config,
 )
 from kiras_rl.envs import make_env
+from kiras_rl.ranges import POSITIVE, SCHEDULES
 from kiras_rl.runner import KirasRunner
 
 
@@ -117,9 +118,24 @@ def test_a_wrong_override_is_refused_and_named(override, part):
     assert part in message
 
 
-@pytest.mark.parametrize("key", ["num_envs", "iterations"])
-def test_counts_must_be_positive(key):
-    assert refusal("solo8", [f"{key}=0"]) == f"{key}=0: at least 1"
+@pytest.mark.parametrize("key", POSITIVE)
+def test_what_must_be_positive_is_refused_at_zero(key):
+    assert refusal("solo8", [f"{key}=0"]).endswith(": must be positive")
+
+
+@pytest.mark.parametrize("key", SCHEDULES)
+@pytest.mark.parametrize("points", ["[]", "[[1,0.1],[0,0.5]]", "[[0.5]]", "[[0,1,2]]"])
+def test_a_schedule_is_a_list_of_points_in_order(key, points):
+    assert "give [fraction of T1, value] points" in refusal("solo8", [f"{key}={points}"])
+
+
+def test_a_rollout_must_fill_its_batches():
+    message = refusal("solo8", ["num_envs=2", "learner.ppo.num_mini_batches=49"])
+    assert message.startswith("learner.ppo.num_mini_batches=49: at most the 48 steps of a rollout")
+
+
+def test_what_is_removed_is_not_looked_at():
+    assert load_config("base", ["learner.imitation=null"]).learner.imitation is None
 
 
 def test_a_missing_value_is_named(write):

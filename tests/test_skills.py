@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from kiras_rl.config import SkillInitConfig
+from kiras_rl.schema import SkillInitConfig
 from kiras_rl.skills import SkillSampler, cover_all_skills, skill_probabilities
 
 

@@ -11,14 +11,14 @@ import mujoco
 import torch
 from mujoco.batch import Batch
 
-from kiras_rl.config import Config, SimConfig
 from kiras_rl.envs import make_env
 from kiras_rl.envs.quadruped import QuadrupedEnv
 from kiras_rl.envs.simulation.base import RANDOMISED_FIELDS
 from kiras_rl.runner import single_threaded
+from kiras_rl.schema import Config, SimConfig
 from kiras_rl.tools.timing import PartTimer, Times, interleave
 
-BARE, NO_SENSORS = "mujoco.batch", "mujoco.batch without sensors"
+BARE, NO_SENSORS = "mujoco.batch", "batch without sensors"
 SIMULATION, ENVIRONMENT = "NativeSimulation.step", "environment step"
 
 ACTION_NOISE = 0.3  # as early in training, around the keyframe's pose: most robots stay up
@@ -26,7 +26,6 @@ WARM_UP = 50  # control steps after the first reset, until the robots stand
 
 PARTS = (
     ("sim", "step", "physics"),
-    ("sim", "forward", "sensors after resets"),
     ("", "step", "rewards, terminations, features"),
     ("_random", "refill", "random numbers"),
     ("", "_begin_next", "tasks and pushes"),
@@ -137,9 +136,7 @@ def measure_environment(config: Config, rounds: int) -> EnvironmentTimes:
     """
     config = replace(config, sim=replace(config.sim, backend="native"))
     with single_threaded("cpu"):
-        work = Workload(
-            make_env(config), config.sim, config.learner.ppo.num_steps, config.seed
-        )
+        work = Workload(make_env(config), config.sim, config.learner.ppo.num_steps, config.seed)
         variants = {
             BARE: work.bare(sensors=True),
             NO_SENSORS: work.bare(sensors=False),
@@ -151,7 +148,10 @@ def measure_environment(config: Config, rounds: int) -> EnvironmentTimes:
 
 
 def _measure_parts(work: Workload, rounds: int) -> Times:
-    """Time the parts in rounds of their own: the clock's calls shall not slow the comparison."""
+    """Time the parts in rounds of their own: the clock's calls shall not slow the comparison.
+
+    A part that no step ran is left out.
+    """
     timer, env = PartTimer(), work.env
     for owner, method, part in PARTS:
         timer.wrap(getattr(env, owner) if owner else env, method, part)
@@ -163,7 +163,7 @@ def _measure_parts(work: Workload, rounds: int) -> Times:
         for part, seconds in timer.seconds.items():
             parts[part].append(seconds / len(work.actions))
     timer.unwrap()
-    return parts
+    return {part: times for part, times in parts.items() if any(times)}
 
 
 def _share_of_resets(work: Workload) -> float:

@@ -37,8 +37,9 @@ def draw_curves(run_dir: Path) -> Path:
         for tag in filter(series.__contains__, prefixes):
             axis.plot(*series[tag], label=tag.split("/")[1])
         axis.set_title(title)
-        axis.legend()
-    axes.flat[0].legend()
+    for axis in axes.flat[[0, 6, 7]]:
+        if axis.lines:
+            axis.legend()
     for axis in axes.flat:
         axis.set_xlabel("iteration")
         axis.grid(alpha=0.3)

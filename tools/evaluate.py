@@ -14,10 +14,11 @@ from rich.console import Console
 from rich.table import Table
 
 from kiras_rl.checkpoint import CheckpointError
-from kiras_rl.config import Config, ConfigError, config_from_dict, load_config
+from kiras_rl.config import ConfigError, config_from_dict, load_config
 from kiras_rl.deploy.metadata import PolicyError
 from kiras_rl.evaluation import Policy, SkillResult, evaluate_skills
 from kiras_rl.robots.robot import RobotError
+from kiras_rl.schema import Config
 from kiras_rl.tools.evaluator import (
     FLOOR,
     make_evaluation_env,
@@ -33,8 +34,9 @@ sensor noise, actuation delay and pushes.
 
 flat         every skill walks straight ahead for 20 s; height and pitch errors are those of a 0.4 s
              moving average after the first second, the velocity error is that of each step
-transitions  every ordered pair of skills, switched while walking: falls, and time until height
-             (1.5 cm) and pitch (3 degrees) stay at the new keyframe for 0.3 s
+transitions  every ordered pair of skills, switched while walking: falls, and time until the moving
+             averages of height (1.5 cm) and pitch (3 degrees) stay at the new keyframe for 0.3 s;
+             a robot that was not in the first skill before the switch counts as not settled
 """
 
 EXAMPLES = """\
@@ -83,6 +85,11 @@ def evaluate(args: argparse.Namespace) -> dict:
     """Run the protocols, print tables and return all figures."""
     onboard = load_policy(args.policy, args.robot)
     metadata, policy = onboard.metadata, onboard_policy(onboard)
+    if "config" not in metadata.provenance:
+        raise ConfigError(
+            "this policy does not say how it was trained (provenance.config is missing): export it "
+            "from its run or checkpoint with kiras-export"
+        )
     config = _physics(config_from_dict(metadata.provenance["config"]), args.nominal)
     skills = len(metadata.skills)
     report: dict = {"provenance": metadata.provenance, "command": args.command}

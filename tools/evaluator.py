@@ -9,14 +9,15 @@ import torch
 from rich.table import Table
 from tensordict import TensorDict
 
-from kiras_rl.config import Config
+from kiras_rl.config import ConfigError
 from kiras_rl.deploy.policy import OnboardPolicy
 from kiras_rl.envs import make_env
 from kiras_rl.envs.quadruped import QuadrupedEnv
-from kiras_rl.evaluation import Policy, SkillResult, evaluate_skills
+from kiras_rl.evaluation import SETTLE, Policy, SkillResult, evaluate_skills
 from kiras_rl.interfaces import HISTORY, PROPRIO
 from kiras_rl.robots.robot import load_robot
 from kiras_rl.runner import Evaluate
+from kiras_rl.schema import Config
 
 FLOOR = {"height": 0.03, "pitch": math.radians(5.0), "velocity": 0.12, "falls": 0.05}
 """What a skill must reach to be called learned: m, rad, m/s, share of robots."""
@@ -37,6 +38,11 @@ def make_evaluator(config: Config, device: str) -> Evaluate | None:
     settings = config.evaluation
     if not settings.interval:
         return None
+    if settings.duration <= SETTLE:
+        raise ConfigError(
+            f"evaluation.duration={settings.duration}: more than the first {SETTLE} s, "
+            "which are not counted"
+        )
     num_envs = settings.worlds_per_skill * len(load_robot(config.robot).skills)
     env = make_evaluation_env(config, num_envs, settings.duration, device)
 

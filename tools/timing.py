@@ -1,4 +1,4 @@
-"""Timing that a busy machine disturbs as little as possible: interleaved rounds, medians, ratios."""
+"""Timing that a busy machine disturbs little: interleaved rounds, medians, ratios."""
 
 from __future__ import annotations
 

@@ -14,7 +14,6 @@ from rich.console import Console
 from kiras_rl import checkpoint
 from kiras_rl.checkpoint import CheckpointError
 from kiras_rl.config import (
-    Config,
     ConfigError,
     check_resume_overrides,
     config_from_dict,
@@ -22,11 +21,12 @@ from kiras_rl.config import (
     load_config,
     save_config,
 )
-from kiras_rl.deploy.policy import OnboardPolicy
+from kiras_rl.deploy.policy import OnboardPolicy, PolicyError, PolicyMetadata
 from kiras_rl.envs import make_env, resolve_backend
-from kiras_rl.export import export_policy
+from kiras_rl.export import ExportError, export_policy
 from kiras_rl.robots.robot import RobotError
-from kiras_rl.runner import KirasRunner
+from kiras_rl.runner import KirasRunner, TrainingError
+from kiras_rl.schema import Config
 from kiras_rl.tools.curves import draw_curves
 from kiras_rl.tools.evaluator import make_evaluator, onboard_policy, results_table
 from kiras_rl.tools.progress import Progress
@@ -54,13 +54,16 @@ examples:
 
 console = Console()
 
+MISTAKES = (CheckpointError, ConfigError, ExportError, PolicyError, RobotError, TrainingError)
+"""Errors whose message is all that a user needs."""
+
 
 def main(argv: list[str] | None = None) -> int:
     """Run the command; return its exit code."""
     args = _parse(argv)
     try:
         return train(args.cfg, args.resume, args.overrides, args.runs)
-    except (ConfigError, CheckpointError, RobotError) as error:
+    except MISTAKES as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
 
@@ -85,7 +88,7 @@ def train(cfg: str | None, resume: Path | None, overrides: list[str], runs: Path
     if resume is not None:
         check_resume_overrides(overrides)
         source = checkpoint.find_checkpoint(resume, prefer=checkpoint.LATEST)
-        run_dir = source.parent.parent
+        run_dir = _run_of(source)
         config = config_from_dict(checkpoint.load_checkpoint(source)["config"], overrides)
     else:
         assert cfg is not None
@@ -94,13 +97,15 @@ def train(cfg: str | None, resume: Path | None, overrides: list[str], runs: Path
     runner = _build(config, run_dir)
     if source is not None:
         runner.load(str(source))
-    run_dir.mkdir(parents=True, exist_ok=True)
+    else:
+        runner.run_dir = run_dir = claim(run_dir)
     save_config(config, run_dir / "config.yaml")
     _announce(config, runner, run_dir, source)
     with Progress(console) as progress:
         finished = runner.learn(on_iteration=progress.show)
     if not finished:
-        console.print(f"stopped and saved; go on with: kiras-train --resume {run_dir}")
+        message = f"stopped and saved; go on with: kiras-train --resume {run_dir}"
+        console.print(message, highlight=False, soft_wrap=True)
         return 0
     _conclude(runner, run_dir)
     return 0
@@ -112,11 +117,34 @@ def _new_run_dir(runs: Path, cfg: str) -> Path:
     return runs / name / stamp
 
 
+def claim(folder: Path) -> Path:
+    """Make a new folder; where one is there, of a run begun in the same second, add a number."""
+    name, number = folder.name, 1
+    while True:
+        try:
+            folder.mkdir(parents=True)
+            return folder
+        except FileExistsError:
+            number += 1
+            folder = folder.with_name(f"{name}.{number}")
+
+
+def _run_of(source: Path) -> Path:
+    if source.absolute().parent.name != checkpoint.FOLDER:
+        raise CheckpointError(
+            f"{source} lies in no run: give the run folder, or a file in its {checkpoint.FOLDER}/"
+        )
+    return source.absolute().parent.parent
+
+
 def _build(config: Config, run_dir: Path) -> KirasRunner:
     device = resolve_device(config.device)
     env = make_env(config, device)
     evaluate = make_evaluator(config, device)
-    return KirasRunner(env, config, run_dir, device, evaluate, commit=_source_commit())
+    runner = KirasRunner(env, config, run_dir, device, evaluate, commit=_source_commit())
+    # What could not be exported is refused now, not after hours of training.
+    PolicyMetadata.from_dict(runner.describe_policy())
+    return runner
 
 
 def _source_commit() -> str:
@@ -171,6 +199,7 @@ def _conclude(runner: KirasRunner, run_dir: Path) -> None:
         f"next:       kiras-play {run_dir} --trace trace.png\n"
         f"            tensorboard --logdir {run_dir}",
         highlight=False,
+        soft_wrap=True,
     )
 
 

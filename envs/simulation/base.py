@@ -1,8 +1,9 @@
 """The protocol between the environment and a physics backend.
 
-Both backends step N copies of one MuJoCo model and hand out the same three things as torch
-tensors on the environment's device: the state, the sensors of every physics step of the last
-control step, and position and velocity sensors that are fresh after resets.
+Both backends step N copies of one MuJoCo model and hand out the same two things as torch tensors
+on the environment's device: the state, and the sensors of every physics step of the last control
+step. Nothing is computed between control steps: what follows from the state alone, the environment
+computes itself (kinematics.py).
 """
 
 from __future__ import annotations
@@ -43,12 +44,9 @@ class Simulation(Protocol):
     """Velocities after the last step or write, (N, nv); base linear in the world frame, base
     angular in the base frame."""
 
-    sensors: torch.Tensor
-    """Sensor data at the last `forward`, (N, S). Position and velocity sensors only: sensors
-    that need accelerations (contacts, forces) are valid in `sensor_record` alone."""
-
     sensor_record: torch.Tensor
-    """Sensor data of each physics step of the last control step, (N, K, S)."""
+    """Sensor data of each physics step of the last control step, (N, K, S). Sensors are taken
+    before each integration: the last ones are a physics step older than `qpos` and `qvel`."""
 
     overflowed: torch.Tensor
     """Worlds that ran out of contact or constraint memory in the last step, (N,) bool."""
@@ -96,10 +94,6 @@ class Simulation(Protocol):
 
     def set_const(self, mask: torch.Tensor) -> None:
         """Recompute the constants that depend on masses in the masked worlds."""
-        ...
-
-    def forward(self) -> None:
-        """Compute position and velocity sensors at the current state of every world."""
         ...
 
     def state_dict(self) -> dict[str, torch.Tensor]:

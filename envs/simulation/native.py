@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import copy
+import logging
+
 import mujoco
 import numpy as np
 import torch
@@ -9,14 +12,11 @@ from mujoco.batch import Batch
 
 from kiras_rl.envs.simulation.base import OVERFLOW_WARNINGS, RANDOMISED_FIELDS
 
-_VELOCITY_STAGE = int(mujoco.mjtStage.mjSTAGE_VEL)
+_log = logging.getLogger(__name__)
+
 _OVERFLOW = [int(w) for w in OVERFLOW_WARNINGS]
-_BAD_STATE = [
-    int(mujoco.mjtWarning.mjWARN_BADQPOS),
-    int(mujoco.mjtWarning.mjWARN_BADQVEL),
-    int(mujoco.mjtWarning.mjWARN_BADQACC),
-    int(mujoco.mjtWarning.mjWARN_BADCTRL),
-]
+# All others: a rollout ends early in a world that MuJoCo warns of, so none may pass unseen.
+_BAD_STATE = [i for i in range(int(mujoco.mjtWarning.mjNWARNING)) if i not in _OVERFLOW]
 
 
 class NativeSimulation:
@@ -37,9 +37,11 @@ class NativeSimulation:
             substeps: Physics steps in a control step, K.
             threads: Threads of the pool; 0 for one a core.
         """
+        self.model = model = copy.copy(model)
         # A diverged world must stay visible: MuJoCo would silently reset it.
         model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
-        self.model = model
+        # Otherwise MuJoCo prints and writes MUJOCO_LOG.TXT into the current folder.
+        mujoco.set_mju_user_warning(_log.warning)
         self.num_worlds = num_worlds
         self.device = torch.device("cpu")
         self._substeps = substeps
@@ -49,14 +51,12 @@ class NativeSimulation:
         self._bind_state()
         self._allocate_outputs()
         self._batch.set_const()  # so that the constants, too, hold one value a world
-        self.forward()
 
     def _bind_state(self) -> None:
         batch = self._batch
         self._qpos, self._qvel = batch.bind("qpos"), batch.bind("qvel")
         self._ctrl, self._time = batch.bind("ctrl"), batch.bind("time")
         self._warmstart = batch.bind("qacc_warmstart")
-        self._sensordata = batch.bind("sensordata")
         self._history_samples = int(self.model.actuator_history[:, 0].max(initial=0))
         self._history = batch.bind("history") if self._history_samples else None
         fresh = mujoco.MjData(self.model).history
@@ -65,10 +65,9 @@ class NativeSimulation:
     def _allocate_outputs(self) -> None:
         n, model = self.num_worlds, self.model
         self._record = np.zeros((n, self._substeps, model.nsensordata))
-        self._warnings = self._batch.warning[..., 1].copy()
+        self._warnings = np.zeros_like(self._batch.warning[..., 1])
         self.qpos = torch.zeros(n, model.nq)
         self.qvel = torch.zeros(n, model.nv)
-        self.sensors = torch.zeros(n, model.nsensordata)
         self.sensor_record = torch.zeros(n, self._substeps, model.nsensordata)
         self.overflowed = torch.zeros(n, dtype=torch.bool)
         self.diverged = torch.zeros(n, dtype=torch.bool)
@@ -76,6 +75,7 @@ class NativeSimulation:
     def step(self, ctrl: torch.Tensor) -> None:
         """Advance every world by one control step."""
         self._ctrl[:] = ctrl.numpy()
+        self._warnings[:] = self._batch.warning[..., 1]  # mjWarningStat.number
         self._batch.rollout(self._substeps, record=["sensordata"], out={"sensordata": self._record})
         self.sensor_record.numpy()[:] = self._record
         self._read_state()
@@ -86,9 +86,7 @@ class NativeSimulation:
         self.qvel.numpy()[:] = self._qvel
 
     def _read_warnings(self) -> None:
-        counts = self._batch.warning[..., 1]  # mjWarningStat.number
-        risen = counts > self._warnings
-        self._warnings[:] = counts
+        risen = self._batch.warning[..., 1] > self._warnings
         finite = np.isfinite(self._qpos).all(1) & np.isfinite(self._qvel).all(1)
         self.overflowed.copy_(torch.from_numpy(risen[:, _OVERFLOW].any(1)))
         self.diverged.copy_(torch.from_numpy(risen[:, _BAD_STATE].any(1) | ~finite))
@@ -132,11 +130,6 @@ class NativeSimulation:
         if len(ids):
             self._batch.set_const(ids.numpy())
 
-    def forward(self) -> None:
-        """Compute position and velocity sensors at the current state of every world."""
-        self._batch.forward(stage=_VELOCITY_STAGE)
-        self.sensors.numpy()[:] = self._sensordata
-
     def state_dict(self) -> dict[str, torch.Tensor]:
         """Return all that the next steps depend on."""
         state = {f"field/{name}": torch.tensor(x) for name, x in self._fields.items()}
@@ -149,4 +142,3 @@ class NativeSimulation:
         self._batch.set_const()
         self._batch.state[:] = state["state"].numpy()
         self._read_state()
-        self.forward()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-MODES = ("gate_update", "bootstrap_input", "both", "none")
+MODES = ("gate_update", "bootstrap_input", "both", "off")
 _MIN_WORLDS = 64  # with completed episodes, before their spread means anything
 
 
@@ -46,7 +46,8 @@ class AdaBoot:
     def renew(self) -> None:
         """Once an iteration: renew p, and which worlds' actors see the estimate."""
         known = self._last[~self._last.isnan()]
-        self._ready = len(known) >= min(_MIN_WORLDS, len(self._last))
+        # one world alone has no spread
+        self._ready = len(known) >= max(2, min(_MIN_WORLDS, len(self._last)))
         if self._ready:
             self.probability = trust(known)
         if self.bootstraps_input:

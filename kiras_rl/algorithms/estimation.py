@@ -9,9 +9,10 @@ from kiras_rl import interfaces as names
 from kiras_rl.algorithms.adaboot import MODES, AdaBoot
 from kiras_rl.algorithms.losses import gaussian_kl, masked_mse
 from kiras_rl.algorithms.storage import GroupRolloutStorage, mini_batches
-from kiras_rl.config import ConfigError, EstimatorConfig
+from kiras_rl.config import ConfigError
 from kiras_rl.interfaces import SkillEnv
 from kiras_rl.models.estimator import VELOCITY_DIM, ContextEstimator
+from kiras_rl.schema import EstimatorConfig
 
 VELOCITY_SCALE = 2.0  # in the loss: velocity errors then weigh as much as observation errors
 

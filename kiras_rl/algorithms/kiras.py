@@ -14,12 +14,12 @@ from kiras_rl import interfaces as names
 from kiras_rl.algorithms import losses, returns
 from kiras_rl.algorithms.estimation import Estimation
 from kiras_rl.algorithms.storage import GroupRolloutStorage, mini_batches
-from kiras_rl.config import LearnerConfig
 from kiras_rl.imitation.self_imitation import SelfImitation
 from kiras_rl.interfaces import SkillEnv
 from kiras_rl.models.critics import GroupCritic
 from kiras_rl.models.exported import ExportedPolicy
 from kiras_rl.schedules import advantage_weights, piecewise_linear
+from kiras_rl.schema import LearnerConfig
 from kiras_rl.skills import SkillSampler
 
 TASK, IMITATION = 0, 1  # reward groups

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import torch
 
-from kiras_rl.config import ConfigError, PremiumConfig
+from kiras_rl.config import ConfigError
+from kiras_rl.schema import PremiumConfig
 
 RULES = ("topk", "record")
 

@@ -8,11 +8,11 @@ from tensordict import TensorDict
 from kiras_rl import interfaces as names
 from kiras_rl.algorithms.losses import discriminator_loss, gradient_penalty
 from kiras_rl.algorithms.storage import GroupRolloutStorage
-from kiras_rl.config import ImitationConfig
 from kiras_rl.imitation.premium import PremiumSelector
 from kiras_rl.interfaces import SkillEnv
 from kiras_rl.models.discriminator import Discriminator, imitation_reward
 from kiras_rl.schedules import piecewise_linear
+from kiras_rl.schema import ImitationConfig
 
 
 class SelfImitation:

@@ -57,6 +57,14 @@ def test_nothing_is_withheld_before_enough_episodes_are_known(make_adaboot):
     assert all(adaboot.update_allowed() for _ in range(20))
 
 
+def test_one_world_alone_is_never_judged():
+    adaboot = AdaBoot("both", 0.0, 1, "cpu")
+    for _ in range(3):
+        adaboot.record(torch.ones(1), torch.ones(1))
+        adaboot.renew()
+    assert adaboot.update_allowed()
+
+
 def test_the_gate_opens_as_often_as_it_trusts(make_adaboot):
     adaboot = make_adaboot("gate_update", floor=0.1)
     finish_episodes(adaboot, torch.full((WORLDS,), -1.0))

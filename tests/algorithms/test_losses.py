@@ -12,6 +12,7 @@ from kiras_rl.algorithms.losses import (
     adapt_learning_rate,
     discriminator_loss,
     gaussian_kl,
+    gradient_penalty,
     masked_mse,
     surrogate_loss,
     value_loss,
@@ -66,6 +67,16 @@ def test_the_discriminator_is_pulled_to_plus_and_minus_one():
 def test_without_a_valid_pair_only_experts_count():
     loss = discriminator_loss(torch.zeros(2), torch.full((2,), 9.0), torch.zeros(2).bool())
     assert loss.item() == 1.0
+
+
+def test_the_gradient_penalty_is_the_squared_slope_in_the_features_that_count():
+    line = torch.nn.Linear(3, 1)
+    line.weight.data = torch.tensor([[1.0, 2.0, 3.0]])
+    penalty = gradient_penalty(
+        lambda x: line(x).squeeze(1), torch.randn(5, 3), torch.randn(5, 3),
+        features=torch.tensor([True, True, False]),
+    )  # fmt: skip
+    assert penalty.item() == 1.0 + 4.0
 
 
 def test_the_divergence_of_gaussians_is_that_of_torch():

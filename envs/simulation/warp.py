@@ -1,0 +1,254 @@
+"""MuJoCo-Warp: the default on a GPU, and on a CPU the twin by which that path is tested.
+
+The kernels are compiled when they are first used, which takes minutes, and kept for later processes
+in Warp's cache: ~/.cache/warp, or the folder that WARP_CACHE_PATH names.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import gc
+import logging
+from collections.abc import Callable, Iterator
+
+import mujoco
+import mujoco_warp as mjw
+import torch
+import warp as wp
+
+from kiras_rl.envs.simulation.base import RANDOMISED_FIELDS
+
+_log = logging.getLogger(__name__)
+wp.config.log_level = wp.LOG_WARNING  # else a line on standard output for each of 70 modules
+
+_CONSTANTS = ("body_subtreemass", "body_invweight0", "dof_invweight0")
+"""Fields that follow from masses: `set_const` gives each world its own."""
+
+_CONSTANT_GROUPS = mjw.SetConstGroup.FIXED | mjw.SetConstGroup.INERT0
+
+# Everything that loses contacts or constraints; the two others only end the solver early.
+_OVERFLOW = int(
+    mjw.OverflowType.ALL & ~(mjw.OverflowType.ITERATIONS | mjw.OverflowType.LS_ITERATIONS)
+)
+
+
+class WarpSimulation:
+    """The Simulation protocol over `mujoco_warp`; see base.py for the members.
+
+    The launches of a control step are fixed: they are recorded once and replayed, on CUDA without
+    waiting for the device.
+
+    Contact memory is one pool of `num_worlds * max_contacts`: when it overflows, all worlds count
+    as overflowed. Constraint memory belongs to each world.
+    """
+
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        num_worlds: int,
+        substeps: int,
+        device: torch.device,
+        max_contacts: int,
+        max_constraints: int,
+        capture: bool = True,
+    ) -> None:
+        """Allocate the worlds, compile the kernels and record the launches.
+
+        Args:
+            model: The scene with the sensors that the environment reads.
+            num_worlds: N.
+            substeps: Physics steps in a control step, K.
+            device: A CUDA device or the CPU.
+            max_contacts: Contacts, the mean over all worlds.
+            max_constraints: Constraint rows a world.
+            capture: Replay recorded launches; otherwise launch kernel by kernel, for debugging.
+        """
+        self.model = model
+        self.num_worlds = num_worlds
+        self.device = device
+        self._substeps = substeps
+        self._warp_device = wp.get_device(str(device))
+        with wp.ScopedDevice(self._warp_device):
+            self._allocate(max_contacts, max_constraints)
+        wp.synchronize_device(self._warp_device)  # torch continues on a stream of its own
+        self._bind_state()
+        self._record_launches(capture)
+
+    def _allocate(self, max_contacts: int, max_constraints: int) -> None:
+        n = self.num_worlds
+        sizes = dict.fromkeys(RANDOMISED_FIELDS + _CONSTANTS, n)
+        self._m = mjw.put_model(self.model, batch_sizes=sizes)
+        self._m.opt.warn_overflow = 0  # printed by the kernels; counted here instead
+        self._d = mjw.make_data(self.model, n, nconmax=max_contacts, njmax=max_constraints)
+        self._record = wp.zeros((self._substeps, n, self.model.nsensordata), dtype=float)
+
+    def _bind_state(self) -> None:
+        """Make tensors that share memory with Warp's arrays: written in place, never replaced."""
+        data = self._d
+        self.qpos, self.qvel = wp.to_torch(data.qpos), wp.to_torch(data.qvel)
+        self._ctrl, self._time = wp.to_torch(data.ctrl), wp.to_torch(data.time)
+        self._warmstart = wp.to_torch(data.qacc_warmstart)
+        self._overflow = wp.to_torch(data.overflow)
+        self.sensor_record = wp.to_torch(self._record).transpose(0, 1)
+        self.overflowed = torch.zeros(self.num_worlds, dtype=torch.bool, device=self.device)
+        self.diverged = torch.zeros_like(self.overflowed)
+        self._fields = {name: wp.to_torch(getattr(self._m, name)) for name in RANDOMISED_FIELDS}
+        self._constants = {name: wp.to_torch(getattr(self._m, name)) for name in _CONSTANTS}
+        self._state = {
+            "qpos": self.qpos,
+            "qvel": self.qvel,
+            "ctrl": self._ctrl,
+            "time": self._time,
+            "qacc_warmstart": self._warmstart,
+        }
+        self._state |= {f"field/{name}": x for name, x in self._fields.items()}
+        self._state |= {f"constant/{name}": x for name, x in self._constants.items()}
+        self._bind_history()
+
+    def _bind_history(self) -> None:
+        # One buffer an actuator: [two cursors, n times, n values] (mjData.history).
+        self._history_samples = int(self.model.actuator_history[:, 0].max(initial=0))
+        if not self._history_samples:
+            return
+        shape = (self.model.nu, 2 + 2 * self._history_samples)
+        fresh = mujoco.MjData(self.model).history.reshape(shape)
+        self._fresh_history = torch.tensor(fresh, dtype=torch.float32, device=self.device)
+        self._history = wp.to_torch(self._d.history).view(self.num_worlds, *shape)
+        self._state["history"] = self._history
+
+    def _record_launches(self, capture: bool) -> None:
+        reason = _obstacle_to_capture(self._warp_device)
+        if capture and reason:
+            _log.warning("No CUDA graphs: %s. Physics will be several times slower", reason)
+            capture = False
+        _log.info("Preparing the kernels of MuJoCo-Warp: minutes the first time, seconds later")
+        initial = self.state_dict()
+        record = functools.partial(_Launches, device=self._warp_device, capture=capture)
+        self._control_step = record(self._launch_control_step)
+        self._set_const = record(lambda: mjw.set_const(self._m, self._d, _CONSTANT_GROUPS))
+        self.load_state_dict(initial)
+        self.sensor_record.zero_()
+
+    def _launch_control_step(self) -> None:
+        for k in range(self._substeps):
+            mjw.step(self._m, self._d)
+            wp.copy(self._record[k], self._d.sensordata)
+
+    def step(self, ctrl: torch.Tensor) -> None:
+        """Advance every world by one control step."""
+        self._ctrl.copy_(ctrl)
+        self._control_step()
+        self._read_warnings()
+
+    def _read_warnings(self) -> None:
+        sound = _sound(self.qpos) & _sound(self.qvel) & _sound(self._ctrl)
+        torch.logical_not(sound, out=self.diverged)
+        torch.ne(self._overflow & _OVERFLOW, 0, out=self.overflowed)
+        self._overflow.zero_()
+
+    def write_state(
+        self, mask: torch.Tensor, qpos: torch.Tensor, qvel: torch.Tensor, ctrl: torch.Tensor
+    ) -> None:
+        """Set the state of the masked worlds and forget their past."""
+        _write(self.qpos, mask, qpos)
+        _write(self.qvel, mask, qvel)
+        _write(self._ctrl, mask, ctrl)
+        self._warmstart.masked_fill_(mask[:, None], 0.0)
+        self._time.masked_fill_(mask, 0.0)
+        if self._history_samples:
+            history = self._fresh_history.repeat(self.num_worlds, 1, 1)
+            history[..., 2 + self._history_samples :] = ctrl[..., None]
+            _write(self._history, mask, history)
+
+    def write_velocity(self, mask: torch.Tensor, qvel: torch.Tensor) -> None:
+        """Set the velocities of the masked worlds."""
+        _write(self.qvel, mask, qvel)
+
+    def write_field(self, name: str, mask: torch.Tensor, values: torch.Tensor) -> None:
+        """Set one of RANDOMISED_FIELDS in the masked worlds."""
+        _write(self._fields[name], mask, values)
+
+    def set_const(self, mask: torch.Tensor) -> None:
+        """Recompute the constants that depend on masses in the masked worlds."""
+        if self.device.type == "cpu" and not mask.any():  # on CUDA the question would cost a wait
+            return
+        before = {name: x.clone() for name, x in self._constants.items()}
+        self._set_const()  # of every world
+        for name, x in self._constants.items():
+            _write(x, ~mask, before[name])
+
+    def state_dict(self) -> dict[str, torch.Tensor]:
+        """Return all that the next steps depend on."""
+        return {name: x.clone() for name, x in self._state.items()}
+
+    def load_state_dict(self, state: dict[str, torch.Tensor]) -> None:
+        """Go on from a saved state."""
+        for name, x in self._state.items():
+            x.copy_(state[name])
+        self._overflow.zero_()
+
+
+class _Launches:
+    """A fixed sequence of kernel launches, on the stream that torch uses at the call."""
+
+    def __init__(self, launch: Callable[[], None], device: wp.Device, capture: bool) -> None:
+        """Launch once, which compiles and loads the kernels, then record."""
+        self._launch, self._device = launch, device
+        self._graph: wp.Graph | None = None
+        self()
+        if capture:
+            recording = wp.ScopedCapture(device, force_module_load=False)
+            with _garbage_kept(), wp.ScopedDevice(device), recording:
+                launch()
+            self._graph = recording.graph
+
+    def __call__(self) -> None:
+        with self._scope():
+            if self._graph is None:
+                self._launch()
+            else:
+                wp.capture_launch(self._graph)
+
+    def _scope(self) -> contextlib.AbstractContextManager:
+        if self._device.is_cpu:
+            return wp.ScopedDevice(self._device)
+        stream = torch.cuda.current_stream(wp.device_to_torch(self._device))
+        return wp.ScopedStream(_warp_stream(stream), sync_enter=False)
+
+
+_warp_stream = functools.lru_cache(maxsize=None)(wp.stream_from_torch)
+
+
+def _obstacle_to_capture(device: wp.Device) -> str | None:
+    """Return why launches cannot be recorded on a device, or None."""
+    if device.is_cpu:
+        return None
+    if not wp.is_mempool_enabled(device):
+        return f"memory pools are off on {device.name}"
+    if not wp.is_conditional_graph_supported():
+        return "the NVIDIA driver is older than CUDA 12.4"
+    return None
+
+
+@contextlib.contextmanager
+def _garbage_kept() -> Iterator[None]:
+    """Suspend garbage collection: what a finalizer frees would become part of the recording."""
+    enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if enabled:
+            gc.enable()
+
+
+def _sound(values: torch.Tensor) -> torch.Tensor:
+    """Return the worlds that MuJoCo itself would not call bad, (N, k) -> (N,) bool."""
+    return (values.abs() <= mujoco.mjMAXVAL).all(1)  # NaN is not
+
+
+def _write(target: torch.Tensor, mask: torch.Tensor, values: torch.Tensor) -> None:
+    """Copy the masked rows of `values` into `target`, (N, ...), without asking which they are."""
+    mask = mask.view(-1, *[1] * (target.dim() - 1))
+    target.copy_(torch.where(mask, values, target))

@@ -1,0 +1,169 @@
+"""The learner on worlds that only count: every part can be left out, none mixes episodes."""
+
+from __future__ import annotations
+
+import copy
+import math
+
+import pytest
+import torch
+
+from kiras_rl.algorithms.kiras import IMITATION, TASK
+
+PARTS = ("imitation", "multi_critic", "estimator", "skill_init")
+
+
+def null(*parts):
+    return [f"learner.{part}=null" for part in parts]
+
+
+def networks(alg):
+    """Return every trained tensor by name."""
+    modules = {"actor": alg.actor, "critic": alg.critic}
+    if alg.imitation:
+        modules["discriminator"] = alg.imitation.discriminator
+    if alg.estimation:
+        modules["estimator"] = alg.estimation.estimator
+    return {f"{m}.{k}": v for m, module in modules.items() for k, v in module.named_parameters()}
+
+
+def collect(runner):
+    """Let the learner act for one rollout, as the runner does."""
+    obs = runner.env.get_observations()
+    with torch.no_grad():
+        for _ in range(runner.cfg["num_steps_per_env"]):
+            obs, rewards, dones, extras = runner.env.step(runner.alg.act(obs))
+            runner.alg.process_env_step(obs, rewards, dones, extras)
+        runner.alg.compute_returns(obs)
+
+
+@pytest.mark.parametrize("without", [(), *[(part,) for part in PARTS], PARTS], ids="-".join)
+def test_it_trains_whatever_is_left_out(make_runner, without):
+    runner, seen = make_runner(*null(*without)), []
+    before = {name: p.detach().clone() for name, p in networks(runner.alg).items()}
+    runner.learn(2, on_iteration=lambda status: seen.append(status.scalars))
+    for scalars in seen:
+        assert all(math.isfinite(value) for value in scalars.values())
+    assert [name for name, p in networks(runner.alg).items() if torch.equal(p, before[name])] == []
+    has_two = not {"imitation", "multi_critic"} & set(without)
+    assert len(runner.alg.critic.critics) == (2 if has_two else 1)
+    assert ("Discriminator/loss" in seen[0]) == ("imitation" not in without)
+    assert ("Estimator/velocity" in seen[0]) == ("estimator" not in without)
+    assert ("Skill/probability_a" in seen[0]) == ("skill_init" not in without)
+
+
+@pytest.mark.parametrize(
+    "overrides", [(), null("estimator"), ["learner.estimator.adaboot=bootstrap_input"]], ids=str
+)
+def test_the_update_sees_the_actions_exactly_as_they_were_drawn(make_runner, overrides):
+    frozen = ["learner.ppo.learning_rate=0", "learner.ppo.learning_rate_range=[0,0]"]
+    runner, seen = make_runner(*frozen, *overrides), []
+    runner.learn(2, on_iteration=lambda status: seen.append(status.scalars))
+    for scalars in seen:
+        assert scalars["Policy/kl"] == pytest.approx(0.0, abs=1e-7)
+        # all ratios are 1, and normalised advantages average to zero
+        assert scalars["Loss/surrogate"] == pytest.approx(0.0, abs=1e-6)
+
+
+@pytest.mark.parametrize("overrides", [(), null("estimator")], ids=str)
+def test_the_exported_policy_is_the_mean_of_the_trained_one(make_runner, overrides):
+    alg = make_runner(*overrides).alg
+    obs = alg.storage.observations[0].clone()
+    obs["proprio"].normal_(), obs["history"].normal_()
+    with torch.no_grad():
+        alg.act(obs)
+    torch.testing.assert_close(alg.act_deterministic(obs), alg.actor.output_mean)
+
+
+def test_no_pair_of_features_straddles_a_reset(make_runner):
+    runner = make_runner()
+    pairs = []
+    hook = runner.alg.imitation.discriminator.register_forward_pre_hook(
+        lambda _, args: pairs.append(args[0].clone())
+    )
+    collect(runner)
+    hook.remove()
+    before, after = torch.cat(pairs).chunk(2, dim=1)
+    assert after[:, 0].max() > 0  # some episodes did end
+    assert torch.equal(before[:, 0], after[:, 0])  # the episode
+    assert torch.equal(before[:, 1] + 1, after[:, 1])  # the step in it
+    assert torch.equal(before[:, 2], after[:, 2])  # the skill
+
+
+def test_an_episode_cut_by_the_clock_goes_on_with_its_value(make_runner):
+    runner = make_runner("learner.ppo.gamma=0.9", "learner.imitation.reward_weight=0")
+    collect(runner)
+    st = runner.alg.storage
+    task = 0.5 - st.actions.square().sum(-1)
+    cut = (st.dones.squeeze(-1) > 0) & ~runner.env.falls
+    assert cut.any() and ((st.dones.squeeze(-1) > 0) & runner.env.falls).any()
+    for group, reward in ((TASK, task), (IMITATION, torch.zeros_like(task))):
+        bootstrapped = reward + torch.where(cut, 0.9 * st.values[..., group], 0.0)
+        torch.testing.assert_close(st.rewards[..., group], bootstrapped)
+
+
+def test_one_critic_learns_the_sum_of_both_rewards(make_runner):
+    gamma = "learner.ppo.gamma=0"
+    two, one = make_runner(gamma), make_runner(gamma, *null("multi_critic"))
+    task = make_runner(gamma, "learner.imitation.reward_weight=0")
+    for runner in (two, one, task):
+        if runner is not two:  # the same networks act and judge
+            runner.alg.actor.load_state_dict(two.alg.actor.state_dict())
+            for name in ("estimation", "imitation"):
+                part = getattr(two.alg, name)
+                getattr(runner.alg, name).load_state_dict(copy.deepcopy(part.state_dict()))
+        torch.manual_seed(2)
+        runner.env.observe()
+        collect(runner)
+    rewards = two.alg.storage.rewards
+    assert rewards[..., IMITATION].min() > 0
+    torch.testing.assert_close(task.alg.storage.rewards[..., TASK], rewards[..., TASK])
+    torch.testing.assert_close(one.alg.storage.rewards[..., 0], rewards.sum(-1))
+
+
+def test_task_rewards_can_be_clipped_at_zero(make_runner):
+    runner = make_runner("learner.ppo.only_positive_rewards=true", "learner.ppo.gamma=0")
+    collect(runner)
+    st = runner.alg.storage
+    task = 0.5 - st.actions.square().sum(-1)
+    assert task.min() < 0 < task.max()
+    torch.testing.assert_close(st.rewards[..., TASK], task.clamp(min=0))
+
+
+def test_the_action_noise_stays_below_its_cap(make_runner):
+    runner = make_runner("learner.ppo.action_std=[[0,0.4],[1,0.1]]")
+    stds = [0.4, 0.25, 0.1]
+    for iteration, std in zip((0, 5, 10), stds, strict=True):
+        runner.alg.load(copy.deepcopy(runner.alg.save()) | {"iteration": iteration})
+        runner.alg.act(runner.env.get_observations())
+        torch.testing.assert_close(runner.alg.actor.output_std, torch.full((16, 2), std))
+
+
+def test_skills_are_drawn_by_their_task_values(make_runner):
+    runner = make_runner("learner.skill_init.smoothing=0", "learner.skill_init.floor=0.01")
+    runner.learn(1)
+    probabilities = runner.env.probabilities
+    assert probabilities.sum() == pytest.approx(1.0)
+    task_critic = runner.alg.critic.critics[TASK]
+    for parameter in task_critic.parameters():
+        torch.nn.init.zeros_(parameter)
+    task_critic.mlp[0].weight.data[0, 0] = 1.0  # V = the first critic number, where positive
+    task_critic.mlp[-1].weight.data[0, 0] = 1.0
+    keyframes = torch.zeros(2, 3, 5)
+    keyframes[..., 0] = torch.tensor([[1.0, 1.0, 4.0], [5.0, 6.0, 7.0]])  # means 2 and 6
+    torch.testing.assert_close(
+        runner.alg.skill_probabilities(keyframes), torch.tensor([1 - 2 / 8, 1 - 6 / 8])
+    )
+
+
+def test_a_saved_learner_goes_on(make_runner):
+    runner, other = make_runner(), make_runner("seed=9")
+    runner.learn(3)
+    saved = copy.deepcopy(runner.alg.save())
+    other.alg.load(saved)
+    assert other.alg.iteration == 3
+    obs = runner.env.get_observations()
+    assert torch.equal(other.alg.act_deterministic(obs), runner.alg.act_deterministic(obs))
+    again = other.alg.save()
+    assert again.keys() == saved.keys()
+    assert torch.equal(again["skill_probabilities"], saved["skill_probabilities"])

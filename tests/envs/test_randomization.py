@@ -1,0 +1,223 @@
+"""Domain randomization: each row of the table reaches the model, and the robot's motion."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from kiras_rl.robots.robot import load_robot
+
+ROWS = ("friction", "payload", "com_shift", "kp_factor", "kd_factor", "action_delay",
+        "push_velocity")  # fmt: skip
+MASS = 2.179  # kg, all of Solo-8
+GRAVITY = 9.81  # m/s^2
+EXACT = ("env.skills.joint_noise=0", "env.skills.velocity_noise=0")
+
+
+@pytest.fixture
+def build(build_env):
+    """Return a function that builds worlds with some rows of the table and no other."""
+
+    def build_with(*extra, num_envs=8, **rows):
+        table = {row: "null" for row in ROWS} | rows
+        overrides = [f"env.randomization.{row}={value}" for row, value in table.items()]
+        return build_env(*overrides, *EXACT, *extra, num_envs=num_envs)
+
+    return build_with
+
+
+def field(env, name):
+    """Return a model field of every world."""
+    return env.sim.state_dict()[f"field/{name}"].float()
+
+
+def sensor(env, kind):
+    """Return the sensors of a kind in every physics step of the last control step, (N, K, ...)."""
+    model = env.sim.model
+    sensors = [model.sensor(i) for i in range(model.nsensor)]
+    chosen = [s for s in sensors if s.name.startswith(f"{kind}/")]
+    columns = [int(s.adr[0]) + i for s in chosen for i in range(int(s.dim[0]))]
+    return env.sim.sensor_record[:, :, columns].clone()
+
+
+def start(env, skill="walk"):
+    """Put every world into one keyframe, at rest, commanded to stand."""
+    skills = torch.full((env.num_envs,), env.skills.index(skill))
+    env.reset(skills, torch.zeros(env.num_envs, 3))
+
+
+def hold(env):
+    """Return the actions that ask for the joints' present angles."""
+    robot = load_robot("solo8")
+    return (env.robot.joint_pos - torch.tensor(robot.default_joint_pos).float()) / 0.5
+
+
+def stand(env, steps=60):
+    """Stand until the robot has come to rest."""
+    start(env)
+    actions = hold(env)
+    for _ in range(steps):
+        env.step(actions)
+
+
+# --- the model -----------------------------------------------------------------------------------
+
+
+def test_every_world_draws_its_own_physics_within_the_ranges(build_env):
+    env = build_env(num_envs=200)
+    nominal, base = env.sim.model, env.sim.model.body("base").id
+    geoms = [env.sim.model.geom(name).id for name in load_robot("solo8").foot_geoms]
+    kp, kd = 5.0, 0.1
+    drawn = {
+        (0.5, 1.25): field(env, "geom_friction")[:, geoms, 0],
+        (-0.5, 0.25): field(env, "body_mass")[:, base] - nominal.body_mass[base],
+        (-0.02, 0.05): field(env, "body_ipos")[:, base] - torch.tensor(nominal.body_ipos[base]),
+        (0.8, 1.2): field(env, "actuator_gainprm")[:, :, 0] / kp,
+        (-1.2, -0.8): field(env, "actuator_biasprm")[:, :, 1] / kp,
+        (-1.2001, -0.8001): field(env, "actuator_biasprm")[:, :, 2] / kd,
+    }
+    for (low, high), values in drawn.items():
+        margin = 0.03 * (high - low)
+        assert low - 2e-4 <= values.min() <= low + margin
+        assert high - margin <= values.max() <= high + 2e-4
+    gain, bias = field(env, "actuator_gainprm"), field(env, "actuator_biasprm")
+    assert torch.equal(gain[:, :, 0], -bias[:, :, 1])
+    delay = field(env, "actuator_delay")[:, 0] / 0.005
+    steps, counts = delay.ceil().unique(return_counts=True)
+    assert steps.tolist() == [0, 1, 2, 3]
+    assert counts.min() > 25
+
+
+def test_physics_is_drawn_anew_at_a_reset_and_stays_until_then(build_env):
+    env = build_env("env.terminations.random_first_length=false")
+    env.episode_length_buf = env.max_episode_length - torch.arange(8)  # world 7 ends in 7 steps
+    env.reset()
+    names = ("geom_friction", "body_mass", "body_ipos", "actuator_gainprm", "actuator_biasprm")
+    env.episode_length_buf = torch.where(torch.arange(8) == 3, env.max_episode_length - 1, 0)
+    before = {name: field(env, name) for name in names}
+    env.step(hold(env))
+    for name in names:
+        changed = (field(env, name) != before[name]).flatten(1).any(dim=1)
+        assert changed.tolist() == [i == 3 for i in range(8)], name
+
+
+def test_without_randomization_physics_is_nominal(build):
+    env = build()
+    for name in ("geom_friction", "body_mass", "body_ipos", "actuator_gainprm", "actuator_delay"):
+        nominal = torch.tensor(getattr(env.sim.model, name)).float()
+        assert torch.equal(field(env, name), nominal.expand(8, *nominal.shape)), name
+
+
+# --- the motion ----------------------------------------------------------------------------------
+
+
+def first_torque(env, action=0.2):
+    """Return the torques of the first physics step after a small change of the targets."""
+    start(env)
+    env.step(hold(env) + action)
+    return sensor(env, "torque")[:, 0]
+
+
+def test_stiffer_springs_pull_harder(build):
+    # kp 5 N m/rad, 0.2 * 0.5 rad away
+    torch.testing.assert_close(first_torque(build()), torch.full((8, 8), 0.5))
+    stiff = first_torque(build(kp_factor="[1.2,1.2]"))
+    torch.testing.assert_close(stiff, torch.full((8, 8), 0.6))
+
+
+def test_stronger_dampers_brake_harder(build):
+    for factor, torque in (("null", -0.2), ("[0.8,0.8]", -0.16)):
+        env = build(kd_factor=factor)
+        start(env)
+        turning = torch.zeros_like(env.sim.qvel)
+        turning[:, 6:] = 2.0  # rad/s against kd 0.1 N m s/rad
+        env.sim.write_velocity(torch.ones(8, dtype=torch.bool), turning)
+        env.step(hold(env))
+        expected = torch.full((8, 8), torque)
+        torch.testing.assert_close(sensor(env, "torque")[:, 0], expected)
+
+
+@pytest.mark.parametrize("delay", [0, 1, 2, 3])
+def test_targets_arrive_late_by_whole_physics_steps(build, delay):
+    env = build(action_delay=f"[{delay},{delay}]")
+    start(env)
+    held = hold(env)
+    env.step(held)  # nothing moves but for the fall of 2 mm
+    before = sensor(env, "torque")[:, -1]
+    env.step(held + 1.0)  # 0.5 rad: 2.5 N m more
+    change = (sensor(env, "torque") - before[:, None]).abs().amin(dim=(0, 2))
+    assert (change > 0.5).tolist() == [k >= delay for k in range(4)]
+
+
+def test_the_first_delayed_targets_hold_the_pose(build):
+    env = build(action_delay="[3,3]")
+    start(env, "crawl")  # far from the angles 0 that an empty delay would ask for
+    env.step(hold(env) + 0.2)
+    assert sensor(env, "torque")[:, 0].abs().max() < 1e-5
+
+
+@pytest.mark.parametrize("payload", [-0.5, 0.0, 0.25])
+def test_a_payload_weighs_on_the_feet(build, payload):
+    env = build(payload=f"[{payload},{payload}]")
+    stand(env)
+    force = sensor(env, "foot")[:, -1].unflatten(1, (4, 3))[..., 2].sum(dim=1).abs()
+    expected = torch.full((8,), (MASS + payload) * GRAVITY)
+    torch.testing.assert_close(force, expected, rtol=0.02, atol=0)
+
+
+def test_the_feet_next_to_the_centre_of_mass_carry_more(build):
+    share = []
+    for shift in ("null", "[0.05,0.05]"):
+        env = build(com_shift=shift)
+        stand(env)
+        force = sensor(env, "foot")[:, -1].unflatten(1, (4, 3))[..., 2].abs()
+        share.append((force[:, :2].sum(dim=1) / force.sum(dim=1)).mean().item())
+    # The trunk moves by 5 cm of the 38 cm between the feet; it is two thirds of the robot.
+    assert share[1] - share[0] == pytest.approx(0.05 / 0.38 * 1.43 / MASS, abs=0.04)
+
+
+def test_slippery_feet_slide_further(build):
+    slid = []
+    for friction in ("[0.5,0.5]", "[1.25,1.25]"):
+        env = build(friction=friction)
+        stand(env, steps=20)
+        before = env.sim.qpos[:, 1].clone()
+        shove = env.sim.qvel.clone()
+        shove[:, 1] = 1.0
+        env.sim.write_velocity(torch.ones(8, dtype=torch.bool), shove)
+        actions = hold(env)
+        for _ in range(10):
+            env.step(actions)
+        slid.append((env.sim.qpos[:, 1] - before).mean().item())
+    assert slid[0] > 1.5 * slid[1]
+
+
+def pushes(env, steps):
+    """Return what was added to the velocity between judging and observing, (T, N, 2)."""
+    start(env)
+    actions, added = hold(env), []
+    for _ in range(steps):
+        env.step(actions)
+        added.append((env.robot.base_lin_vel_h - env.measure().lin_vel_h)[:, :2])
+    return torch.stack(added)
+
+
+def test_a_push_adds_its_velocity_to_the_base(build):
+    env = build("env.randomization.push_interval=0.02", push_velocity="[0.04,0.05]")
+    added = pushes(env, 5)
+    assert (added.norm(dim=-1) > 0.04 * 2**0.5 - 1e-4).all()
+    assert (added.norm(dim=-1) < 0.05 * 2**0.5 + 1e-4).all()
+
+
+def test_pushes_come_once_an_interval_on_average(build):
+    env = build(
+        "env.randomization.push_interval=0.2", push_velocity="[-0.1,0.1]", num_envs=100
+    )  # fmt: skip
+    added = pushes(env, 20)
+    pushed = (added.norm(dim=-1) > 1e-6).float().mean().item()
+    assert pushed == pytest.approx(0.1, abs=0.03)
+    assert added.min() < -0.09 and added.max() > 0.09
+
+
+def test_nobody_is_pushed_without_pushes(build):
+    assert pushes(build(), 5).abs().max() == 0.0

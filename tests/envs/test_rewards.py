@@ -1,0 +1,151 @@
+"""Every reward term on one step whose numbers are chosen, and the sum's rules."""
+
+from __future__ import annotations
+
+import inspect
+import math
+
+import pytest
+import torch
+
+from kiras_rl.config import ConfigError
+from kiras_rl.envs import rewards
+from kiras_rl.envs.rewards import RewardSum
+from kiras_rl.envs.state import Keyframes, RobotState, Step, Task
+from kiras_rl.schema import RewardConfig
+
+WALK, CRAWL = 0, 1
+KEYFRAMES = Keyframes(
+    height=torch.tensor([0.2, 0.1]),
+    pitch=torch.zeros(2),
+    joint_pos=torch.tensor([[0.5, -1.0], [1.0, -2.0]]),
+    gravity_b=torch.tensor([[0.0, 0.0, -1.0], [0.0, 0.0, -1.0]]),
+)
+
+
+def row(*values):
+    """Return one world's numbers."""
+    return torch.tensor([values])
+
+
+def crafted(command=(0.5, 0.0, 0.2), fresh=False, fallen=False):
+    """Return a step of one world with two joints, two feet and two other geoms."""
+    robot = RobotState.at_rest(KEYFRAMES, torch.tensor([CRAWL]), num_feet=2)
+    robot.base_height = torch.tensor([0.15])
+    robot.gravity_b = row(0.6, 0.0, -0.8)
+    robot.base_lin_vel_h = row(0.3, -0.1, 0.05)
+    robot.base_ang_vel_b = row(-0.2, 0.4, -0.5)
+    robot.yaw_rate = torch.tensor([0.5])
+    robot.joint_pos = row(0.7, -1.7)
+    robot.joint_vel = row(0.6, -0.4)
+    robot.joint_torque = row(2.0, -1.0)
+    robot.foot_contact = torch.tensor([[True, False]])
+    robot.foot_vel_w = torch.tensor([[[0.3, -0.4, 9.0], [5.0, 5.0, 5.0]]])
+    robot.foot_force = row(60.0, 12.0)
+    robot.limb_force = row(0.05, 3.0)
+    return Step(
+        robot=robot,
+        task=Task(row(*command), torch.tensor([CRAWL]), torch.tensor([WALK])),
+        keyframes=KEYFRAMES,
+        action=row(1.0, 2.0),
+        last_action=row(-2.0, 6.0),
+        last_joint_vel=row(0.5, 0.0),
+        last_joint_torque=row(1.0, 1.0),
+        fresh=torch.tensor([fresh]),
+        fallen=torch.tensor([fallen]),
+        dt=0.02,
+    )
+
+
+def value(name, step, **parameters):
+    """Return a term's value with weight 1."""
+    config = RewardConfig(scale_by_dt=False, terms={name: {"weight": 1.0} | parameters})
+    return RewardSum(config, step.dt, torch.device("cpu"))(step).item()
+
+
+EXPECTED = {
+    "tracking_lin_vel": ({"sigma": 0.25}, math.exp(-(0.2**2) / 0.25)),
+    "tracking_ang_vel": ({"sigma": 0.25}, math.exp(-(0.3**2) / 0.25)),
+    "action_rate": ({}, 5.0),  # |(3, -4)|
+    "action_rate_squared": ({}, 25.0),
+    "torques": ({}, 4.0 + 1.0),
+    "delta_torques": ({}, 1.0 + 4.0),
+    "joint_acceleration": ({}, (0.1**2 + 0.4**2) / 0.02**2),
+    "ang_vel_xy": ({}, 0.04 + 0.16),
+    "ang_vel_x_abs": ({}, 0.2),
+    "ang_vel_z_abs": ({}, 0.5),
+    "lin_vel_y": ({}, 0.01),
+    "lin_vel_y_abs": ({}, 0.1),
+    "foot_slip": ({}, 0.09 + 0.16),  # the second foot is in the air
+    "feet_drag": ({}, -(0.3 + 0.4)),
+    "feet_contact_forces": ({"threshold": 10.0, "largest": 20.0}, 20.0 + 2.0),
+    "collision": ({"threshold": 0.1}, 1.0),
+    "stand_still": ({}, 0.0),
+    "stand_still_pose": ({}, 0.0),
+    "skill_height": ({"sigma": 0.05}, math.exp(-1.0)),  # 5 cm above crawl
+    "skill_orientation": ({"sigma": 0.4}, math.exp(-(0.6**2 + 0.2**2) / 0.16)),
+    "termination": ({}, 0.0),
+}
+
+
+@pytest.mark.parametrize("name", EXPECTED)
+def test_a_term_s_value(name):
+    parameters, expected = EXPECTED[name]
+    assert value(name, crafted(), **parameters) == pytest.approx(expected, rel=1e-5)
+
+
+def test_every_term_is_tested():
+    terms = {
+        name for name, f in inspect.getmembers(rewards, inspect.isfunction)
+        if f.__module__ == rewards.__name__ and not name.startswith("_")
+    }  # fmt: skip
+    assert terms == set(EXPECTED)
+
+
+def test_sideways_errors_count_as_much_as_they_are_asked_to():
+    expected = math.exp(-(0.2**2 + 2.0 * 0.1**2) / 0.25)
+    assert value("tracking_lin_vel", crafted(), sigma=0.25, lateral=2.0) == pytest.approx(expected)
+
+
+@pytest.mark.parametrize(
+    ("command", "stands"),
+    [((0.0, 0.0, 0.0), True), ((0.09, 0.0, 0.0), True), ((0.0, 0.0, 0.11), False)],
+)
+def test_standing_still_is_asked_for_by_a_small_command(command, stands):
+    step = crafted(command)
+    assert value("stand_still", step) == pytest.approx(0.6 + 0.4 if stands else 0.0)
+    # from the keyframe of the commanded skill: (1, -2)
+    assert value("stand_still_pose", step) == pytest.approx(0.3 + 0.3 if stands else 0.0)
+
+
+def test_the_first_step_has_no_change_of_torque():
+    assert value("delta_torques", crafted(fresh=True)) == 0.0
+
+
+def test_a_fall_is_told():
+    assert value("termination", crafted(fallen=True)) == 1.0
+
+
+@pytest.mark.parametrize(("scale_by_dt", "factor"), [(False, 1.0), (True, 0.02)])
+def test_terms_are_weighed_and_scaled(scale_by_dt, factor):
+    terms = {"torques": {"weight": -0.1}, "action_rate": None, "lin_vel_y_abs": {"weight": 3.0}}
+    total = RewardSum(RewardConfig(scale_by_dt, terms), 0.02, torch.device("cpu"))
+    assert total.names == ["torques", "lin_vel_y_abs"]
+    expected = torch.tensor([[-0.5, 0.3]]) * factor
+    torch.testing.assert_close(total(crafted()), expected)
+
+
+@pytest.mark.parametrize(
+    ("terms", "message"),
+    [
+        ({"torque": {"weight": 1.0}}, "no term 'torque': did you mean 'torques'?"),
+        ({"torques": {"weight": 1.0, "sigma": 2.0}}, "torques: unknown parameter 'sigma'"),
+        ({"torques": {}}, "torques: no weight; it takes weight"),
+        ({"torques": -0.1}, "torques: give a weight, as in torques: {weight: 1.0}"),
+        ({"collision": {"weight": 1.0}}, "collision: missing a required argument: 'threshold'"),
+    ],
+)
+def test_a_term_that_cannot_be_is_refused(terms, message):
+    with pytest.raises(ConfigError) as caught:
+        RewardSum(RewardConfig(scale_by_dt=False, terms=terms), 0.02, torch.device("cpu"))
+    assert message in str(caught.value)

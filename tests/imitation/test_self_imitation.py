@@ -1,0 +1,125 @@
+"""The discriminator: it separates what can be separated, and rewards what looks expert."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from kiras_rl import interfaces as names
+from kiras_rl.algorithms.storage import GroupRolloutStorage
+from kiras_rl.config import load_config
+from kiras_rl.imitation.self_imitation import SelfImitation
+from kiras_rl.models.discriminator import imitation_reward
+
+STEPS, WORLDS = 4, 32
+KEYFRAMES = torch.tensor([[0.0, 0.0, 1.0, 0.0], [1.0, 0.0, 0.0, 1.0]])  # two numbers, one-hot
+
+
+@pytest.fixture
+def make_imitation():
+    """Return a function that builds a small discriminator taught by keyframes alone."""
+
+    def make(*overrides):
+        small = [
+            "learner.imitation.discriminator.hidden_dims=[32]",
+            "learner.imitation.discriminator.updates=10",
+            "learner.imitation.discriminator.batch_size=256",
+            "learner.imitation.discriminator.gradient_penalty=0",
+            "learner.imitation.premium.keyframe_share=1",
+            "learner.imitation.reward_weight=2",
+        ]
+        config = load_config("base", [*small, *overrides]).learner.imitation
+        noise = torch.tensor([0.05, 0.05, 0.0, 0.0])
+        return SelfImitation(config, KEYFRAMES, noise, ("a", "b"), WORLDS, STEPS)
+
+    return make
+
+
+def rollout(imitation, shift, valid=True):
+    """Hold every world in its skill's keyframe, shifted by a vector; return rewards and storage."""
+    skill = torch.arange(WORLDS) % 2
+    features = KEYFRAMES[skill] + torch.tensor([*shift, 0.0, 0.0])
+    before = TensorDict(
+        {
+            names.IMITATION: features,
+            names.SKILL: KEYFRAMES[skill][:, 2:],
+            names.COMMAND: torch.full((WORLDS, 3), 0.3),
+        },
+        batch_size=[WORLDS],
+    )
+    storage = GroupRolloutStorage(WORLDS, STEPS, 1, before, 1, "cpu")
+    extras = {
+        names.EXTRA_TIME_OUTS: torch.zeros(WORLDS, dtype=torch.bool),
+        names.EXTRA_IMITATION: features,
+        names.EXTRA_VALID: torch.full((WORLDS,), valid),
+    }
+    for step in range(STEPS):
+        storage.observations[step].copy_(before)
+        zero = torch.zeros(WORLDS)
+        with torch.no_grad():
+            rewards = imitation.record(before, zero, zero, extras)
+    return rewards, storage
+
+
+def test_the_reward_is_one_for_an_expert_and_zero_for_the_policy():
+    scores = torch.tensor([-5.0, -1.0, 0.0, 1.0, 2.0, 3.0, 9.0])
+    assert imitation_reward(scores).tolist() == [0.0, 0.0, 0.75, 1.0, 0.75, 0.0, 0.0]
+
+
+def test_it_tells_a_shifted_motion_from_the_keyframes(make_imitation):
+    imitation = make_imitation()
+    for iteration in range(60):
+        first, storage = rollout(imitation, [0.0, 0.5])
+        scalars = imitation.update(storage, iteration, progress=0.0)
+    assert scalars["Discriminator/expert"] > 0.8
+    assert scalars["Discriminator/policy"] < -0.8
+    assert first.max() < 0.3  # what the policy does earns little,
+    near, _ = rollout(imitation, [0.0, 0.0])
+    assert near.min() > 1.8  # what it should do nearly all: 2 is the weight
+
+
+def test_the_gradient_penalty_keeps_the_slope_low(make_imitation):
+    imitation = make_imitation("learner.imitation.discriminator.gradient_penalty=1")
+    for iteration in range(40):
+        _, storage = rollout(imitation, [0.0, 0.5])
+        scalars = imitation.update(storage, iteration, progress=1.0)
+    # A line of slope s in both frames scores +-s/2 half a unit apart, and its squared gradient is
+    # 2 s^2: 2 (1 - s/2)^2 + 2 s^2 is least at s = 2/5.
+    assert scalars["Discriminator/expert"] == pytest.approx(0.2, abs=0.02)
+    assert scalars["Discriminator/policy"] == pytest.approx(-0.2, abs=0.02)
+
+
+def test_the_reward_is_logged_by_skill(make_imitation):
+    imitation = make_imitation()
+    rewards, storage = rollout(imitation, [0.0, 0.5])
+    scalars = imitation.update(storage, 0, progress=0.0)
+    assert scalars["Imitation/reward_a"] == pytest.approx(rewards[::2].mean().item())
+    assert scalars["Imitation/reward_b"] == pytest.approx(rewards[1::2].mean().item())
+
+
+def test_steps_that_do_not_count_earn_and_teach_nothing(make_imitation):
+    imitation = make_imitation()
+    for iteration in range(30):
+        rewards, storage = rollout(imitation, [0.0, 0.5], valid=False)
+        assert not rewards.any()
+        imitation.update(storage, iteration, progress=0.0)
+    with torch.no_grad():
+        score = imitation.discriminator(storage.observations[names.IMITATION][0].repeat(1, 2))
+    assert score.min() > 0.5  # only experts pull, and they pull up
+
+
+def test_the_instance_noise_shrinks_with_progress(make_imitation):
+    imitation = make_imitation("learner.imitation.discriminator.noise=[[0,1],[1,0.2]]")
+    spreads = []
+    for progress in (0.0, 1.0):
+        _, storage = rollout(imitation, [0.0, 0.5])
+        seen = []
+        hook = imitation.discriminator.register_forward_pre_hook(
+            lambda _, args, seen=seen: seen.append(args[0].detach())
+        )
+        imitation.update(storage, 0, progress)
+        hook.remove()
+        policy = torch.cat([batch[256:] for batch in seen if len(batch) == 512])
+        spreads.append(policy[:, 1].std().item())  # 0.5 in every pair
+    assert spreads == pytest.approx([0.05, 0.01], rel=0.1)

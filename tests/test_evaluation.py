@@ -1,0 +1,152 @@
+"""The deterministic evaluation's numbers, on recordings that can be judged by eye."""
+
+from __future__ import annotations
+
+import dataclasses
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+from kiras_rl.evaluation import (
+    Recording,
+    SkillResult,
+    as_scalars,
+    lifts_per_second,
+    moving_average,
+    score,
+    summarize,
+)
+
+DT, STEPS = 0.1, 30  # the first ten steps are the second that does not count
+KEYFRAMES = SimpleNamespace(
+    skills=("low", "high"),
+    keyframe_height=torch.tensor([0.2, 0.3]),
+    keyframe_pitch=torch.tensor([0.0, 0.1]),
+)
+PERFECT = SkillResult(
+    height=0.2, pitch=0.0, velocity=0.3, height_error=0.0, pitch_error=0.0, velocity_error=0.0,
+    lifts=2.0, distinct=1.0, falls=0.0,
+)  # fmt: skip
+
+
+@pytest.fixture
+def recording():
+    """Four robots, two a skill, that hold their keyframes, walk at the command and never fall."""
+    skill = torch.tensor([0, 1, 0, 1])
+    return Recording(
+        skill=skill,
+        command=torch.tensor([[0.3, 0.0, 0.0]]).repeat(4, 1),
+        height=KEYFRAMES.keyframe_height[skill].repeat(STEPS, 1),
+        pitch=KEYFRAMES.keyframe_pitch[skill].repeat(STEPS, 1),
+        velocity=torch.full((STEPS, 4), 0.3),
+        contact=(torch.arange(STEPS)[:, None, None] % 4 < 2).expand(STEPS, 4, 2).clone(),
+        alive=torch.ones(STEPS, 4, dtype=torch.bool),
+        step_dt=DT,
+    )
+
+
+def test_a_robot_in_its_keyframe_has_no_error(recording):
+    for name, result in summarize(recording, KEYFRAMES).items():
+        index = KEYFRAMES.skills.index(name)
+        assert result.height == pytest.approx(KEYFRAMES.keyframe_height[index].item())
+        assert result.pitch == pytest.approx(KEYFRAMES.keyframe_pitch[index].item())
+        assert result.velocity == pytest.approx(0.3)
+        errors = (result.height_error, result.pitch_error, result.velocity_error, result.falls)
+        assert errors == pytest.approx((0, 0, 0, 0), abs=1e-6)
+        assert result.distinct == 1.0
+
+
+def test_errors_are_averaged_over_the_robots_of_a_skill(recording):
+    recording.height[:, 0] += 0.02
+    recording.height[:, 2] -= 0.04
+    recording.pitch[:, 1] += 0.1
+    recording.velocity[::2, 3] += 0.2
+    low, high = summarize(recording, KEYFRAMES).values()
+    assert low.height == pytest.approx(0.19)
+    assert low.height_error == pytest.approx(0.03)
+    assert high.pitch_error == pytest.approx(0.05)
+    assert high.velocity == pytest.approx(0.35)
+    assert high.velocity_error == pytest.approx(0.05)
+
+
+def test_the_bounce_of_a_gait_is_no_height_error_but_a_change_of_speed_is_one(recording):
+    bounce = 0.03 * torch.tensor([1.0, 1.0, -1.0, -1.0]).repeat(8)[:STEPS, None]
+    recording.height.add_(bounce)
+    recording.velocity.add_(bounce)
+    low = summarize(recording, KEYFRAMES)["low"]
+    assert low.height_error == pytest.approx(0.0, abs=1e-6)
+    assert low.velocity_error == pytest.approx(0.03)
+
+
+def test_the_first_second_does_not_count(recording):
+    recording.height[:7] += 1.0  # the average of step 10 begins at step 7
+    recording.velocity[:10] += 1.0
+    low = summarize(recording, KEYFRAMES)["low"]
+    assert (low.height_error, low.velocity_error) == pytest.approx((0, 0), abs=1e-6)
+
+
+def test_a_robot_counts_until_it_falls(recording):
+    recording.alive[20:, 0] = False
+    recording.height[20:, 0] = 9.0
+    recording.velocity[20:, 0] = 9.0
+    low, high = summarize(recording, KEYFRAMES).values()
+    assert (low.falls, high.falls) == (0.5, 0.0)
+    assert low.height == pytest.approx(0.2)
+    assert (low.height_error, low.velocity_error) == pytest.approx((0, 0), abs=1e-6)
+
+
+def test_a_robot_that_falls_at_once_still_has_numbers(recording):
+    recording.alive[3:, :] = False
+    for result in summarize(recording, KEYFRAMES).values():
+        assert result.falls == 1.0
+        assert all(torch.isfinite(torch.tensor(x)) for x in dataclasses.astuple(result))
+
+
+def test_a_robot_in_another_skill_s_keyframe_is_not_distinct(recording):
+    recording.height[:, 0] = 0.3
+    recording.pitch[:, 0] = 0.1
+    recording.height[:, 2] = 0.24  # still nearer to its own
+    low, high = summarize(recording, KEYFRAMES).values()
+    assert (low.distinct, high.distinct) == (0.5, 1.0)
+
+
+def test_the_foot_that_lifts_least_counts():
+    contact = torch.ones(20, 1, 3, dtype=torch.bool)
+    contact[1::4, :, 0] = False  # 5 lifts in 2 s
+    contact[1::2, :, 1] = False
+    contact[5:9, :, 2] = False  # one lift
+    assert lifts_per_second(contact, DT).tolist() == [0.5]
+    assert lifts_per_second(contact[..., :2], DT).tolist() == [2.5]
+
+
+def test_the_average_looks_back_four_tenths_of_a_second():
+    signal = torch.tensor([[0.0], [4.0], [8.0], [0.0], [4.0]])
+    assert moving_average(signal, DT).squeeze(1).tolist() == [0.0, 1.0, 3.0, 3.0, 4.0]
+
+
+def test_the_score_is_zero_when_perfect_and_one_at_a_limit():
+    assert score({"a": PERFECT}) == 0.0
+    at_limit = dataclasses.replace(PERFECT, height_error=0.03)
+    assert score({"a": at_limit}) == pytest.approx(1.0)
+    assert score({"a": at_limit, "b": PERFECT}) == pytest.approx(0.5)
+    still = dataclasses.replace(PERFECT, lifts=0.0, velocity_error=0.12)
+    assert score({"a": still}) == pytest.approx(2.0)
+
+
+@pytest.mark.parametrize(
+    "worse",
+    [{"height_error": 0.04}, {"pitch_error": 0.1}, {"velocity_error": 0.2}, {"falls": 0.1},
+     {"lifts": 0.5}],
+)  # fmt: skip
+def test_a_skill_is_learned_when_every_number_is_within_its_limit(worse):
+    limits = {"height": 0.03, "pitch": 0.087, "velocity": 0.12, "falls": 0.05}
+    assert PERFECT.meets(**limits)
+    assert not dataclasses.replace(PERFECT, **worse).meets(**limits)
+
+
+def test_results_are_logged_by_skill():
+    scalars = as_scalars({"walk": PERFECT})
+    assert scalars["Eval/score"] == 0.0
+    assert scalars["Eval_walk/lifts"] == 2.0
+    assert len(scalars) == 1 + len(dataclasses.fields(SkillResult))

@@ -1,0 +1,161 @@
+"""The runner: a stopped training goes on bit for bit, and nothing else loads into it."""
+
+from __future__ import annotations
+
+import signal
+import threading
+
+import pytest
+import torch
+
+from kiras_rl.checkpoint import CheckpointError, load_checkpoint, save_checkpoint
+from kiras_rl.config import load_config
+from kiras_rl.envs import make_env
+from kiras_rl.runner import KirasRunner, StopRequest
+
+# Noise, randomization and delay are on; episodes and premium windows end many times.
+TINY = (
+    "num_envs=16",
+    "iterations=6",
+    "sim.backend=native",
+    "env.terminations.episode_length=0.5",
+    "evaluation.interval=0",
+    "learner.estimator.adaboot=both",
+    "learner.imitation.premium.window=24",
+    "learner.imitation.premium.min_command=0",
+    "learner.imitation.premium.max_distance=100",
+    "learner.imitation.discriminator.batch_size=128",
+)
+
+
+@pytest.fixture
+def make_runner(tmp_path):
+    """Return a function that builds a run from its configuration: what a new process does."""
+
+    def make(run, *overrides, evaluate=None):
+        config = load_config("solo8", [*TINY, *overrides])
+        return KirasRunner(make_env(config), config, tmp_path / run, "cpu", evaluate)
+
+    return make
+
+
+@pytest.fixture
+def tell():
+    """Return a function that sums up a run's evaluations as a constant result."""
+    from kiras_rl.evaluation import SkillResult
+
+    return lambda error: {"walk": SkillResult(0.2, 0.0, 0.3, error, 0.0, 0.0, 2.0, 1.0, 0.0)}
+
+
+def latest(runner):
+    return runner.run_dir / "checkpoints" / "latest.pt"
+
+
+def differences(a, b, path=""):
+    """List where two nested states differ."""
+    if isinstance(a, dict):
+        assert a.keys() == b.keys(), path
+        return [d for key in a for d in differences(a[key], b[key], f"{path}/{key}")]
+    if isinstance(a, list | tuple):
+        assert len(a) == len(b), path
+        return [d for i, pair in enumerate(zip(a, b, strict=True))
+                for d in differences(*pair, f"{path}/{i}")]  # fmt: skip
+    if isinstance(a, torch.Tensor):
+        same = a.dtype == b.dtype and torch.equal(torch.nan_to_num(a), torch.nan_to_num(b))
+        return [] if same else [path]
+    return [] if a == b else [path]
+
+
+def test_a_resumed_training_ends_with_the_same_bits(make_runner):
+    whole = make_runner("whole")
+    assert whole.learn()
+    first = make_runner("parts")
+    assert not first.learn(3)
+    second = make_runner("parts", "seed=77")  # what it draws before loading must not matter
+    second.load(str(latest(first)))
+    assert second.current_learning_iteration == 3
+    assert second.learn()
+    one, other = load_checkpoint(latest(whole)), load_checkpoint(latest(second))
+    assert one["iteration"] == other["iteration"] == 6
+    for part in ("learner", "env", "generators", "policy"):
+        assert differences(one[part], other[part], part) == []
+    assert one["learner"]["imitation"]["selector"]["scores"].isfinite().any()
+    assert one["learner"]["estimation"]["adaboot"]["ready"]
+
+
+def test_another_seed_is_another_training(make_runner):
+    one, other = make_runner("one"), make_runner("other", "seed=2")
+    for runner in (one, other):
+        runner.learn(1)
+    assert differences(one.alg.actor.state_dict(), other.alg.actor.state_dict())
+
+
+def test_a_checkpoint_of_other_skills_is_refused(make_runner):
+    runner = make_runner("run")
+    runner.save_latest()
+    foreign = load_checkpoint(latest(runner)) | {"skills": ["walk", "jump"]}
+    save_checkpoint(latest(runner), foreign)
+    with pytest.raises(CheckpointError) as caught:
+        runner.load(str(latest(runner)))
+    message = str(caught.value)
+    assert "was trained on the skills walk, jump; the robot has walk, crawl" in message
+    assert "\n" not in message
+
+
+def test_the_best_evaluation_is_kept(make_runner, tell):
+    errors = iter([0.03, 0.01, 0.02])
+    runner = make_runner(
+        "run", "iterations=3", "evaluation.interval=1", evaluate=lambda _: tell(next(errors))
+    )
+    seen = []
+    runner.learn(on_iteration=lambda status: seen.append(status.scalars["Eval/score"]))
+    assert seen == pytest.approx([1.0, 1 / 3, 2 / 3])
+    best = load_checkpoint(runner.run_dir / "checkpoints" / "best.pt")
+    assert best["iteration"] == 2
+    assert best["best_score"] == pytest.approx(1 / 3)
+
+
+@pytest.mark.parametrize(("interval", "evaluated"), [(2, [2, 4, 5]), (10, [5]), (0, [])])
+def test_evaluations_come_at_their_interval_and_at_the_end(make_runner, tell, interval, evaluated):
+    runner = make_runner(
+        "run", "iterations=5", f"evaluation.interval={interval}", "learner.ppo.num_steps=2",
+        evaluate=lambda _: tell(0.0),
+    )  # fmt: skip
+    seen = []
+
+    def note(status):
+        if "Eval/score" in status.scalars:
+            seen.append(status.iteration)
+
+    runner.learn(on_iteration=note)
+    assert seen == evaluated
+
+
+def test_without_a_folder_nothing_is_written(tmp_path):
+    config = load_config("solo8", [*TINY, "iterations=1"])
+    KirasRunner(make_env(config), config, None, "cpu").learn()
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_becomes_a_wish_to_stop_once(number):
+    before = signal.getsignal(number)
+    with StopRequest() as stop:
+        assert not stop.requested
+        signal.raise_signal(number)
+        assert stop.requested
+        assert signal.getsignal(number) == before  # a second signal acts at once
+    assert signal.getsignal(number) == before
+
+
+def test_a_training_beside_the_main_thread_takes_no_signals():
+    flags = []
+
+    def work():
+        with StopRequest() as stop:
+            flags.append(stop.requested)
+
+    thread = threading.Thread(target=work)
+    thread.start()
+    thread.join()
+    assert flags == [False]

@@ -1,0 +1,193 @@
+"""What KiRAS costs: iterations against stock rsl-rl PPO and against itself with a part left out."""
+
+from __future__ import annotations
+
+import contextlib
+import copy
+import io
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import torch
+from rsl_rl.env import VecEnv
+from rsl_rl.runners import OnPolicyRunner
+from tensordict import TensorDict
+from torch import nn
+
+from kiras_rl import interfaces as names
+from kiras_rl.envs import make_env
+from kiras_rl.envs.quadruped import QuadrupedEnv
+from kiras_rl.runner import KirasRunner, single_threaded
+from kiras_rl.schema import Config, LearnerConfig
+from kiras_rl.tools.timing import PartTimer, Times, interleave
+
+STOCK, STOCK_SINGLE = "rsl-rl PPO", "rsl-rl PPO, 1-thread rollout"
+KIRAS = "KiRAS"
+REMOVABLE = ("imitation", "multi_critic", "estimator", "skill_init")
+"""Blocks of `learner` that null removes."""
+
+_UNGATED = {"gate_update": "off", "both": "bootstrap_input"}
+"""AdaBoot modes -> the same without withheld updates: the price is that of a full iteration."""
+
+
+@dataclass(frozen=True)
+class LearningTimes:
+    """Seconds of an iteration (rollout and update), and of its update alone."""
+
+    iterations: Times
+    updates: Times
+
+
+class StockView(VecEnv):
+    """The environment with only the observation groups that stock PPO uses: it stores them all."""
+
+    def __init__(self, env: QuadrupedEnv) -> None:
+        """Show `env`."""
+        self.env = env
+        self.num_envs, self.num_actions = env.num_envs, env.num_actions
+        self.max_episode_length = env.max_episode_length
+        self.episode_length_buf = env.episode_length_buf
+        self.device, self.cfg = env.device, env.cfg
+
+    def get_observations(self) -> TensorDict:
+        """Return the groups of stock PPO."""
+        return _select(self.env.get_observations())
+
+    def step(self, actions: torch.Tensor) -> tuple[TensorDict, torch.Tensor, torch.Tensor, dict]:
+        """Advance the environment."""
+        obs, rewards, dones, extras = self.env.step(actions)
+        return _select(obs), rewards, dones, extras
+
+
+def _select(obs: TensorDict) -> TensorDict:
+    return obs.select(names.PROPRIO, names.HISTORY, names.CRITIC)
+
+
+def measure_learning(config: Config, rounds: int, device: str) -> LearningTimes:
+    """Time iterations of every learner on one environment, from the same states.
+
+    Raises:
+        ConfigError: As `make_env`.
+        RobotError: As `make_env`.
+    """
+    env = make_env(config, device)
+    bench = _LearningBench(env, device)
+    bench.add(STOCK, lambda: _make_stock(env, config, device), _iterate_stock)
+    bench.add(STOCK_SINGLE, lambda: _make_stock(env, config, device), _iterate_stock_single)
+    for name, learner in _learners(config.learner).items():
+        variant = replace(config, learner=learner)
+        bench.add(name, lambda v=variant: KirasRunner(env, v, None, device), lambda r: r._iterate())
+    return bench.measure(rounds)
+
+
+def without(part: str) -> str:
+    """Return the name of KiRAS with a part left out."""
+    return f"{KIRAS} without {part}"
+
+
+def _learners(full: LearnerConfig) -> dict[str, LearnerConfig]:
+    """Return KiRAS as configured, and without each part that it has."""
+    full = copy.deepcopy(full)
+    if full.estimator is not None:
+        full.estimator.adaboot = _UNGATED.get(full.estimator.adaboot, full.estimator.adaboot)
+    present = [part for part in REMOVABLE if getattr(full, part) is not None]
+    return {KIRAS: full} | {without(part): replace(full, **{part: None}) for part in present}
+
+
+class _LearningBench:
+    """Learners that take turns on one environment."""
+
+    def __init__(self, env: QuadrupedEnv, device: str) -> None:
+        self._env, self._device = env, device
+        self._state = copy.deepcopy(env.state_dict())
+        self._runs: dict[str, Callable[[], float]] = {}
+        self._updates: Times = {}
+
+    def add(
+        self,
+        name: str,
+        make: Callable[[], OnPolicyRunner],
+        iterate: Callable[[OnPolicyRunner], object],
+    ) -> None:
+        """Build a learner on a fresh observation: learners add groups of their own to it."""
+        self._restore()
+        runner, timer = make(), PartTimer()
+        timer.wrap(runner.alg, "update", "update")
+        self._updates[name] = []
+
+        def run() -> float:
+            self._restore()
+            timer.clear()
+            begin = time.perf_counter()
+            iterate(runner)
+            self._wait()
+            seconds = time.perf_counter() - begin
+            self._updates[name].append(timer.seconds["update"])
+            return seconds
+
+        self._runs[name] = run
+
+    def measure(self, rounds: int) -> LearningTimes:
+        """Time all of them."""
+        iterations = interleave(self._runs, rounds)
+        updates = {name: times[-rounds:] for name, times in self._updates.items()}
+        return LearningTimes(iterations, updates)
+
+    def _restore(self) -> None:
+        self._env.load_state_dict(copy.deepcopy(self._state))
+
+    def _wait(self) -> None:
+        if torch.device(self._device).type == "cuda":
+            torch.cuda.synchronize()
+
+
+def _iterate_stock(runner: OnPolicyRunner) -> None:
+    runner.learn(1)
+
+
+def _iterate_stock_single(runner: OnPolicyRunner) -> None:
+    """Run stock's iteration with the thread policy of KirasRunner."""
+    threads, update = torch.get_num_threads(), runner.alg.update
+
+    def update_on_all() -> dict[str, float]:
+        torch.set_num_threads(threads)
+        return update()
+
+    runner.alg.update = update_on_all
+    with single_threaded(runner.device):
+        runner.learn(1)
+    runner.alg.update = update
+
+
+def _make_stock(env: QuadrupedEnv, config: Config, device: str) -> OnPolicyRunner:
+    torch.manual_seed(config.seed)
+    with contextlib.redirect_stdout(io.StringIO()):  # it prints its networks
+        runner = OnPolicyRunner(StockView(env), _stock_config(config.learner), None, device)
+    # Like the actor of KiRAS, so that the robots move alike and the physics costs the same
+    nn.init.normal_(runner.alg.actor.mlp[-1].weight, std=0.01)
+    nn.init.zeros_(runner.alg.actor.mlp[-1].bias)
+    return runner
+
+
+def _stock_config(learner: LearnerConfig) -> dict:
+    """Return rsl-rl's dictionary: what KiRAS has in common with PPO is the same."""
+    ppo = learner.ppo
+    same = ("num_mini_batches", "gamma", "lam", "clip_param", "value_loss_coef")
+    same += ("max_grad_norm", "learning_rate")
+    std = ppo.action_std[0][1]
+    noise = {"class_name": "GaussianDistribution", "init_std": std, "std_type": "log"}
+    network = {"class_name": "MLPModel", "activation": "elu", "obs_normalization": False}
+    return {
+        "algorithm": {
+            "class_name": "PPO",
+            "num_learning_epochs": ppo.num_epochs,
+            "desired_kl": ppo.desired_kl[0][1],
+            **{key: getattr(ppo, key) for key in same},
+        },
+        "actor": {**network, "hidden_dims": list(ppo.actor_dims), "distribution_cfg": noise},
+        "critic": {**network, "hidden_dims": list(ppo.critic_dims)},
+        "obs_groups": {"actor": [names.PROPRIO, names.HISTORY], "critic": [names.CRITIC]},
+        "num_steps_per_env": ppo.num_steps,
+        "save_interval": 1,  # never used: nothing is written without a log folder
+    }
