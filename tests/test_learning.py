@@ -22,7 +22,8 @@ ITERATIONS = 45  # of a run planned for more: its schedules stay where skills ar
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory):
     """The run, what it logged in each iteration, and its last evaluation."""
-    overrides = ["iterations=260", f"evaluation.interval={ITERATIONS}", "device=cpu"]
+    schedule = ["iterations=260", f"evaluation.interval={ITERATIONS}"]
+    overrides = [*schedule, "device=cpu", "learner.estimator.adaboot=off"]
     config = load_config("solo8_quick", overrides)
     run = tmp_path_factory.mktemp("run")
     runner = KirasRunner(make_env(config), config, run, "cpu", make_evaluator(config, "cpu"))

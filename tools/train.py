@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import datetime
+import logging
 import subprocess
 import sys
 from pathlib import Path
@@ -61,6 +62,8 @@ MISTAKES = (CheckpointError, ConfigError, ExportError, PolicyError, RobotError, 
 def main(argv: list[str] | None = None) -> int:
     """Run the command; return its exit code."""
     args = _parse(argv)
+    logging.basicConfig(format="%(message)s")
+    logging.getLogger("kiras_rl").setLevel(logging.INFO)  # "kernels compile": minutes, once
     try:
         return train(args.cfg, args.resume, args.overrides, args.runs)
     except MISTAKES as error:
