@@ -2,7 +2,7 @@
 # Needed: GNU make and a Python of at least 3.11 with its venv module.
 
 .DEFAULT_GOAL := help
-.PHONY: help train test lint types check clean
+.PHONY: help train test lint types clean
 
 CFG ?= solo8_quick
 PYTHON ?= python3.13 python3.12 python3.11 python3
@@ -29,15 +29,13 @@ lint: .venv/.installed-dev  ## check style and format
 # Type checkers do not follow the package map of an editable install, so a plain copy is checked:
 # what it calls kiras_rl/envs/x.py is envs/x.py here. MuJoCo 4.0 comes without stubs for its
 # compiled modules: the one-line stub says that `mujoco` holds more than its Python source shows.
-types: .venv/.installed-dev  ## check the types
+types: .venv/.installed-dev  ## check the types (not clean yet, and no gate)
 	rm -rf .venv/typed
 	.venv/bin/python -m pip install -q --no-deps --target .venv/typed .
 	cp pyproject.toml .venv/typed
 	mkdir -p .venv/typed/typings/mujoco
 	echo 'def __getattr__(name: str): ...' > .venv/typed/typings/mujoco/__init__.pyi
 	cd .venv/typed && ../bin/pyright --pythonpath ../bin/python kiras_rl
-
-check: lint types  ## lint and types
 
 clean:  ## remove the environment and build outputs, never runs/
 	rm -rf .venv build dist *.egg-info .pytest_cache .ruff_cache
