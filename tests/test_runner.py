@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import signal
 import threading
 
@@ -9,7 +10,7 @@ import pytest
 import torch
 
 from kiras_rl.checkpoint import CheckpointError, load_checkpoint, save_checkpoint
-from kiras_rl.config import load_config
+from kiras_rl.config import list_configs, load_config
 from kiras_rl.envs import make_env
 from kiras_rl.runner import KirasRunner, StopRequest
 
@@ -81,6 +82,22 @@ def test_a_resumed_training_ends_with_the_same_bits(make_runner):
         assert differences(one[part], other[part], part) == []
     assert one["learner"]["imitation"]["selector"]["scores"].isfinite().any()
     assert one["learner"]["estimation"]["adaboot"]["ready"]
+
+
+@pytest.mark.parametrize("cfg", [name for name in list_configs() if name.startswith("ablations/")])
+def test_every_ablation_trains_without_the_part_it_leaves_out(cfg):
+    config, seen = load_config(cfg, ["num_envs=4", "iterations=2", "evaluation.interval=0"]), []
+    runner = KirasRunner(make_env(config), config, None, "cpu")
+    runner.learn(on_iteration=lambda status: seen.append(status.scalars))
+    for scalars in seen:
+        assert all(math.isfinite(value) for value in scalars.values())
+    logged = set(seen[-1])
+    without = cfg.removeprefix("ablations/")
+    assert ("Discriminator/loss" in logged) == (without != "no_sil")
+    assert ("Reward/skill_height" in logged) == (without == "no_sil")
+    assert ("Critic/imitation_value" in logged) == (without not in ("no_sil", "no_muc"))
+    assert ("Estimator/velocity" in logged) == (without != "no_ece")
+    assert ("Skill/probability_walk" in logged) == (without != "no_skill_init")
 
 
 def test_another_seed_is_another_training(make_runner):
