@@ -6,6 +6,8 @@ from dataclasses import dataclass
 
 import mujoco
 
+from kiras_rl.envs.terrain_geoms import TerrainGeoms, add_terrain, terrain_geoms
+from kiras_rl.envs.terrain_library import TerrainLibrary
 from kiras_rl.robots.robot import Robot
 
 _OBJ = mujoco.mjtObj
@@ -34,22 +36,33 @@ class SensorLayout:
 
 @dataclass(frozen=True)
 class Scene:
-    """A compiled model with the addresses that the environment needs."""
+    """A compiled model with the addresses that the environment needs.
+
+    `terrain` holds what a simulation writes to show a tile, None on flat ground.
+    """
 
     model: mujoco.MjModel
     sensors: SensorLayout
     base_body: int
     robot_geoms: list[int]
+    terrain: TerrainGeoms | None = None
 
 
-def build_scene(robot: Robot, timestep: float, solver_iterations: int, max_delay: int = 0) -> Scene:
-    """Compile the scene of a robot on flat ground.
+def build_scene(
+    robot: Robot,
+    timestep: float,
+    solver_iterations: int,
+    max_delay: int = 0,
+    library: TerrainLibrary | None = None,
+) -> Scene:
+    """Compile the scene of a robot.
 
     Args:
         robot: The robot.
         timestep: Physics step, s.
         solver_iterations: Newton and line-search iterations at most.
         max_delay: Longest actuation delay in physics steps; 0 allocates no delay buffers.
+        library: Tiles that a world may show; None for flat ground, which costs nothing.
     """
     spec = robot.spec(visuals=False)
     spec.option.timestep = timestep
@@ -58,6 +71,8 @@ def build_scene(robot: Robot, timestep: float, solver_iterations: int, max_delay
     if max_delay:
         for actuator in spec.actuators:
             actuator.nsample = max_delay
+    if library is not None:
+        add_terrain(spec, library)
     names = _add_sensors(spec, robot)
     model = spec.compile()
     return Scene(
@@ -65,6 +80,7 @@ def build_scene(robot: Robot, timestep: float, solver_iterations: int, max_delay
         sensors=SensorLayout(**{key: _span(model, value) for key, value in names.items()}),
         base_body=model.body(robot.base_body).id,
         robot_geoms=[i for i in range(model.ngeom) if model.geom_priority[i] > 0],
+        terrain=None if library is None else terrain_geoms(model, library),
     )
 
 

@@ -88,6 +88,22 @@ class RandomizationConfig:
 
 
 @dataclass
+class TerrainConfig:
+    """Tiles: type name -> {proportion, parameters of the type}; null removes a type.
+
+    A list of two numbers holds the values of the lowest and of the top level.
+    """
+
+    levels: int
+    variants: int
+    scale: float
+    seed: int
+    cell: float
+    noise: tuple[float, float]
+    types: dict[str, Any]
+
+
+@dataclass
 class EnvConfig:
     """The Markov decision process."""
 
@@ -98,6 +114,7 @@ class EnvConfig:
     skills: SkillConfig
     terminations: TerminationConfig
     randomization: RandomizationConfig
+    terrain: TerrainConfig | None
 
 
 @dataclass

@@ -96,6 +96,15 @@ class Simulation(Protocol):
         """Recompute the constants that depend on masses in the masked worlds."""
         ...
 
+    def write_terrain(self, mask: torch.Tensor, tile: torch.Tensor) -> None:
+        """Show a tile in the masked worlds; all start on tile 0. Needs a scene with terrain.
+
+        Args:
+            mask: Worlds to write, (N,) bool.
+            tile: Numbers of tiles in the scene's library, (N,) int64.
+        """
+        ...
+
     def state_dict(self) -> dict[str, torch.Tensor]:
         """Return all that the next steps depend on."""
         ...

@@ -11,6 +11,7 @@ import torch
 from mujoco.batch import Batch
 
 from kiras_rl.envs.simulation.base import OVERFLOW_WARNINGS, RANDOMISED_FIELDS
+from kiras_rl.envs.terrain_geoms import TERRAIN_FIELDS, TerrainGeoms
 
 _log = logging.getLogger(__name__)
 
@@ -27,7 +28,12 @@ class NativeSimulation:
     """
 
     def __init__(
-        self, model: mujoco.MjModel, num_worlds: int, substeps: int, threads: int = 0
+        self,
+        model: mujoco.MjModel,
+        num_worlds: int,
+        substeps: int,
+        threads: int = 0,
+        terrain: TerrainGeoms | None = None,
     ) -> None:
         """Allocate the worlds.
 
@@ -36,6 +42,7 @@ class NativeSimulation:
             num_worlds: N.
             substeps: Physics steps in a control step, K.
             threads: Threads of the pool; 0 for one a core.
+            terrain: The tiles that a world may show, if the scene has any.
         """
         self.model = model = copy.copy(model)
         # A diverged world must stay visible: MuJoCo would silently reset it.
@@ -50,6 +57,7 @@ class NativeSimulation:
         self._fields = {name: self._batch.expand(name) for name in RANDOMISED_FIELDS}
         self._bind_state()
         self._allocate_outputs()
+        self._bind_terrain(terrain)
         self._batch.set_const()  # so that the constants, too, hold one value a world
 
     def _bind_state(self) -> None:
@@ -61,6 +69,19 @@ class NativeSimulation:
         self._history = batch.bind("history") if self._history_samples else None
         fresh = mujoco.MjData(self.model).history
         self._fresh_history = fresh.reshape(self.model.nu, -1).copy()
+
+    def _bind_terrain(self, terrain: TerrainGeoms | None) -> None:
+        self._terrain = terrain
+        self._tile = np.zeros(self.num_worlds, dtype=np.int64)
+        self._terrain_fields = {}
+        if terrain is not None:
+            for name in TERRAIN_FIELDS:
+                self._terrain_fields[name] = self._batch.expand(name)[:, terrain.geoms]
+            self._show_tiles(slice(None))
+
+    def _show_tiles(self, rows: np.ndarray | slice) -> None:
+        for name, field in self._terrain_fields.items():
+            field[rows] = self._terrain.fields[name][self._tile[rows]]
 
     def _allocate_outputs(self) -> None:
         n, model = self.num_worlds, self.model
@@ -130,15 +151,25 @@ class NativeSimulation:
         if len(ids):
             self._batch.set_const(ids.numpy())
 
+    def write_terrain(self, mask: torch.Tensor, tile: torch.Tensor) -> None:
+        """Show a tile in the masked worlds."""
+        rows = mask.nonzero().squeeze(1).numpy()
+        if len(rows):
+            self._tile[rows] = tile.numpy()[rows]
+            self._show_tiles(rows)
+            self._batch.set_const(rows)  # renews the bounding volumes, or boxes collide wrongly
+
     def state_dict(self) -> dict[str, torch.Tensor]:
         """Return all that the next steps depend on."""
         state = {f"field/{name}": torch.tensor(x) for name, x in self._fields.items()}
-        return state | {"state": torch.tensor(self._batch.state)}
+        return state | {"state": torch.tensor(self._batch.state), "tile": torch.tensor(self._tile)}
 
     def load_state_dict(self, state: dict[str, torch.Tensor]) -> None:
         """Go on from a saved state."""
         for name, field in self._fields.items():
             field[:] = state[f"field/{name}"].numpy()
+        self._tile[:] = state["tile"].numpy()
+        self._show_tiles(slice(None))
         self._batch.set_const()
         self._batch.state[:] = state["state"].numpy()
         self._read_state()

@@ -18,6 +18,7 @@ import torch
 import warp as wp
 
 from kiras_rl.envs.simulation.base import RANDOMISED_FIELDS
+from kiras_rl.envs.terrain_geoms import TERRAIN_FIELDS, TerrainGeoms
 
 _log = logging.getLogger(__name__)
 wp.config.log_level = wp.LOG_WARNING  # else a line on standard output for each of 70 modules
@@ -51,6 +52,8 @@ class WarpSimulation:
         device: torch.device,
         max_contacts: int,
         max_constraints: int,
+        max_ccd: int | None = None,
+        terrain: TerrainGeoms | None = None,
         capture: bool = True,
     ) -> None:
         """Allocate the worlds, compile the kernels and record the launches.
@@ -62,6 +65,8 @@ class WarpSimulation:
             device: A CUDA device or the CPU.
             max_contacts: Contacts, the mean over all worlds.
             max_constraints: Constraint rows a world.
+            max_ccd: Pairs of a geom and a height field, the mean over all worlds.
+            terrain: The tiles that a world may show, if the scene has any.
             capture: Replay recorded launches; otherwise launch kernel by kernel, for debugging.
         """
         self.model = model
@@ -70,17 +75,27 @@ class WarpSimulation:
         self._substeps = substeps
         self._warp_device = wp.get_device(str(device))
         with wp.ScopedDevice(self._warp_device):
-            self._allocate(max_contacts, max_constraints)
+            self._allocate(max_contacts, max_constraints, max_ccd, terrain)
         wp.synchronize_device(self._warp_device)  # torch continues on a stream of its own
         self._bind_state()
+        self._bind_terrain(terrain)
         self._record_launches(capture)
 
-    def _allocate(self, max_contacts: int, max_constraints: int) -> None:
+    def _allocate(
+        self,
+        max_contacts: int,
+        max_constraints: int,
+        max_ccd: int | None,
+        terrain: TerrainGeoms | None,
+    ) -> None:
         n = self.num_worlds
-        sizes = dict.fromkeys(RANDOMISED_FIELDS + _CONSTANTS, n)
+        fields = RANDOMISED_FIELDS + _CONSTANTS + (TERRAIN_FIELDS if terrain else ())
+        sizes = dict.fromkeys(fields, n)
         self._m = mjw.put_model(self.model, batch_sizes=sizes)
         self._m.opt.warn_overflow = 0  # printed by the kernels; counted here instead
-        self._d = mjw.make_data(self.model, n, nconmax=max_contacts, njmax=max_constraints)
+        self._d = mjw.make_data(
+            self.model, n, nconmax=max_contacts, njmax=max_constraints, nccdmax=max_ccd
+        )
         self._record = wp.zeros((self._substeps, n, self.model.nsensordata), dtype=float)
 
     def _bind_state(self) -> None:
@@ -116,6 +131,27 @@ class WarpSimulation:
         self._fresh_history = torch.tensor(fresh, dtype=torch.float32, device=self.device)
         self._history = wp.to_torch(self._d.history).view(self.num_worlds, *shape)
         self._state["history"] = self._history
+
+    def _bind_terrain(self, terrain: TerrainGeoms | None) -> None:
+        self._tile = torch.zeros(self.num_worlds, dtype=torch.int64, device=self.device)
+        self._state["tile"] = self._tile
+        self._terrain_tables: list[tuple[torch.Tensor, torch.Tensor]] = []
+        if terrain is None:
+            return
+        for name, values in terrain.fields.items():
+            # A bounding box is two vectors in Warp: its centre and its half sizes.
+            field = wp.to_torch(getattr(self._m, name))
+            table = torch.tensor(values, device=self.device).to(field.dtype)
+            target = field[:, terrain.geoms]
+            self._terrain_tables.append((target, table.view(len(table), *target.shape[1:])))
+            if name == "geom_pos":  # positions of geoms that cannot move are computed only once
+                placed = wp.to_torch(self._d.geom_xpos)[:, terrain.geoms]
+                self._terrain_tables.append((placed, table.float()))
+        self._show_tiles()
+
+    def _show_tiles(self) -> None:
+        for target, table in self._terrain_tables:
+            target.copy_(table[self._tile])
 
     def _record_launches(self, capture: bool) -> None:
         reason = _obstacle_to_capture(self._warp_device)
@@ -178,6 +214,11 @@ class WarpSimulation:
         for name, x in self._constants.items():
             _write(x, ~mask, before[name])
 
+    def write_terrain(self, mask: torch.Tensor, tile: torch.Tensor) -> None:
+        """Show a tile in the masked worlds."""
+        _write(self._tile, mask, tile)
+        self._show_tiles()
+
     def state_dict(self) -> dict[str, torch.Tensor]:
         """Return all that the next steps depend on."""
         return {name: x.clone() for name, x in self._state.items()}
@@ -186,6 +227,7 @@ class WarpSimulation:
         """Go on from a saved state."""
         for name, x in self._state.items():
             x.copy_(state[name])
+        self._show_tiles()
         self._overflow.zero_()
 
 
