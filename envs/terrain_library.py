@@ -82,6 +82,12 @@ def build_library(config: TerrainConfig) -> TerrainLibrary:
     Raises:
         ConfigError: An unknown type or parameter, or a shape that cannot be.
     """
+    cells = 2 * HALF / config.cell
+    if abs(cells - round(cells)) > 1e-6:
+        raise ConfigError(
+            f"{_KEY}.cell={config.cell:g}: a tile of {2 * HALF:g} m has to be a whole number of "
+            "cells, as with 0.1"
+        )
     types = {name: values for name, values in config.types.items() if values is not None}
     tiles, reliefs = [], []
     for name, values in types.items():

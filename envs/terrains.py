@@ -88,8 +88,15 @@ class Draw:
         return float(ends[0] + (ends[1] - ends[0]) * self.difficulty)
 
     def length(self, limits: Range) -> float:
-        """Return `value` times the scale, m."""
-        return self.scale * self.value(limits)
+        """Return `value` times the scale, m.
+
+        Raises:
+            ValueError: As `value`, or not positive.
+        """
+        length = self.scale * self.value(limits)
+        if length <= 0:
+            raise ValueError(f"{limits!r} m is not a length: it has to be positive")
+        return length
 
 
 def flat(draw: Draw) -> Tile:
@@ -102,9 +109,15 @@ def slopes(draw: Draw, angle: Range) -> Tile:
 
     Args:
         draw: Which tile.
-        angle: Inclination, degrees.
+        angle: Inclination, 0 to 60 degrees.
+
+    Raises:
+        ValueError: Another inclination.
     """
-    steepness = np.tan(np.radians(draw.value(angle)))
+    degrees = draw.value(angle)
+    if not 0.0 <= degrees <= 60.0:
+        raise ValueError(f"an angle of {degrees:g} degrees; allowed are 0 to 60")
+    steepness = np.tan(np.radians(degrees))
 
     def ground(x: np.ndarray, y: np.ndarray) -> np.ndarray:
         way = np.maximum(np.maximum(abs(x), abs(y)), PLATFORM)
@@ -140,7 +153,7 @@ def footholds(draw: Draw, plate: Range, gap: Range, depth: Range, unevenness: Ra
     """
     moat, step = draw.length(gap), draw.length(gap) + draw.length(plate)
     inner = np.arange(PLATFORM + moat, HALF - draw.length(plate), step)
-    uneven = draw.length(unevenness) * draw.rng.uniform(-0.5, 0.5, (len(inner), 4))
+    uneven = draw.scale * draw.value(unevenness) * draw.rng.uniform(-0.5, 0.5, (len(inner), 4))
     top = draw.length(depth)
     return _separate(inner, inner + draw.length(plate), top + uneven, centre=top)
 

@@ -18,6 +18,7 @@ import torch
 import warp as wp
 
 from kiras_rl.envs.simulation.base import RANDOMISED_FIELDS
+from kiras_rl.envs.simulation.overflow import OverflowMonitor
 from kiras_rl.envs.terrain_geoms import TERRAIN_FIELDS, TerrainGeoms
 
 _log = logging.getLogger(__name__)
@@ -32,6 +33,16 @@ _CONSTANT_GROUPS = mjw.SetConstGroup.FIXED | mjw.SetConstGroup.INERT0
 _OVERFLOW = int(
     mjw.OverflowType.ALL & ~(mjw.OverflowType.ITERATIONS | mjw.OverflowType.LS_ITERATIONS)
 )
+
+_Bits = mjw.OverflowType
+_BUDGETS = {
+    int(_Bits.BROADPHASE | _Bits.NARROWPHASE): "too few contacts, raise sim.max_contacts,",
+    int(_Bits.NEFC | _Bits.NJMAX_NNZ): "too few constraint rows, raise sim.max_constraints,",
+    int(_Bits.CCD | _Bits.EPA_HORIZON): "too few pairs with a height field, raise sim.max_ccd,",
+    int(_Bits.HFIELD): "too fine a height field, raise env.terrain.cell,",
+    int(_Bits.CONTACT_MATCH): "more contacts on one geom than its sensor takes",
+}
+"""What overflowed, and the key to change."""
 
 
 class WarpSimulation:
@@ -93,6 +104,8 @@ class WarpSimulation:
         sizes = dict.fromkeys(fields, n)
         self._m = mjw.put_model(self.model, batch_sizes=sizes)
         self._m.opt.warn_overflow = 0  # printed by the kernels; counted here instead
+        if max_ccd is not None:
+            max_ccd = min(max_ccd, max_contacts)
         self._d = mjw.make_data(
             self.model, n, nconmax=max_contacts, njmax=max_constraints, nccdmax=max_ccd
         )
@@ -108,6 +121,7 @@ class WarpSimulation:
         self.sensor_record = wp.to_torch(self._record).transpose(0, 1)
         self.overflowed = torch.zeros(self.num_worlds, dtype=torch.bool, device=self.device)
         self.diverged = torch.zeros_like(self.overflowed)
+        self._monitor = OverflowMonitor(_BUDGETS, self.num_worlds, self.device)
         self._fields = {name: wp.to_torch(getattr(self._m, name)) for name in RANDOMISED_FIELDS}
         self._constants = {name: wp.to_torch(getattr(self._m, name)) for name in _CONSTANTS}
         self._state = {
@@ -181,6 +195,7 @@ class WarpSimulation:
         sound = _sound(self.qpos) & _sound(self.qvel) & _sound(self._ctrl)
         torch.logical_not(sound, out=self.diverged)
         torch.ne(self._overflow & _OVERFLOW, 0, out=self.overflowed)
+        self._monitor.record(self._overflow)
         self._overflow.zero_()
 
     def write_state(
@@ -218,6 +233,19 @@ class WarpSimulation:
         """Show a tile in the masked worlds."""
         _write(self._tile, mask, tile)
         self._show_tiles()
+
+    def usage(self) -> dict[str, float]:
+        """Return what the last physics step took of the budgets, by key; waits for the device.
+
+        `max_contacts` bounds the pairs that are near each other, too. Of both the mean of all
+        worlds counts, of `max_constraints` the largest world.
+        """
+        data = self._d
+        contacts = max(data.ncollision.numpy()[0], data.nacon.numpy()[0])
+        return {
+            "max_contacts": float(contacts) / self.num_worlds,
+            "max_constraints": float(data.nefc.numpy().max()),
+        }
 
     def state_dict(self) -> dict[str, torch.Tensor]:
         """Return all that the next steps depend on."""
