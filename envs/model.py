@@ -54,6 +54,7 @@ def build_scene(
     solver_iterations: int,
     max_delay: int = 0,
     library: TerrainLibrary | None = None,
+    visuals: bool = False,
 ) -> Scene:
     """Compile the scene of a robot.
 
@@ -63,8 +64,9 @@ def build_scene(
         solver_iterations: Newton and line-search iterations at most.
         max_delay: Longest actuation delay in physics steps; 0 allocates no delay buffers.
         library: Tiles that a world may show; None for flat ground, which costs nothing.
+        visuals: Keep the geoms that are only looked at.
     """
-    spec = robot.spec(visuals=False)
+    spec = robot.spec(visuals=visuals)
     spec.option.timestep = timestep
     spec.option.iterations = solver_iterations
     spec.option.ls_iterations = solver_iterations

@@ -394,4 +394,5 @@ def _make_simulation(
         device,
         max_contacts=sim_cfg.max_contacts,
         max_constraints=sim_cfg.max_constraints,
+        max_ccd=sim_cfg.max_ccd,
     )

@@ -16,8 +16,8 @@ from kiras_rl.envs.terrains import HALF
 
 _GEOM = mujoco.mjtGeom
 _BASE = 0.5  # m of solid ground below the lowest point of a height field
-_STONE = ((0.64, 0.60, 0.55, 1.0), (0.74, 0.70, 0.64, 1.0))  # rings take turns
-_SOIL = (0.47, 0.49, 0.42, 1.0)
+_STONE = ((0.72, 0.70, 0.66, 1.0), (0.82, 0.80, 0.76, 1.0))  # rings take turns
+_SOIL = (0.56, 0.50, 0.40, 1.0)
 
 TERRAIN_FIELDS = ("geom_pos", "geom_size", "geom_rbound", "geom_aabb", "geom_dataid")
 """Fields of MjModel that tell one tile from another."""

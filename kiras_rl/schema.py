@@ -21,6 +21,7 @@ class SimConfig:
     solver_iterations: int
     max_contacts: int
     max_constraints: int
+    max_ccd: int
 
 
 @dataclass
