@@ -11,7 +11,8 @@ SINK = 0.005
 """Depth of calm ground below what it follows, m: a foot then touches the floor or a box alone, and
 not the height field besides."""
 
-_WAVELENGTHS = (1.6, 0.8, 0.4, 0.2)  # m, each half as high as the one before
+_WAVELENGTHS = (0.8, 0.4, 0.2)  # m: from a robot's length to a foot's
+_PERSISTENCE = 0.6  # height of each octave as a part of the one before
 _SHORE = 0.4  # m over which noise grows from the platform outwards
 
 
@@ -49,7 +50,7 @@ def fractal_noise(rng: np.random.Generator, points: int) -> np.ndarray:
         values = rng.random((cell[-1] + 2, cell[-1] + 2))
         rows = values[cell] + part[:, None] * (values[cell + 1] - values[cell])
         field = rows[:, cell] + part * (rows[:, cell + 1] - rows[:, cell])
-        total += 0.5**octave * field
+        total += _PERSISTENCE**octave * field
     return (total - total.min()) / np.ptp(total)
 
 

@@ -92,7 +92,7 @@ def draw(robot: Robot, library: TerrainLibrary) -> Figure:
     """
     rows = _rows(library)
     pictures = _render(robot, library, {tile for _, tiles in rows for tile in tiles if tile >= 0})
-    tiles = [pictures.get(tile) for _, tiles in rows for tile in tiles]
+    tiles = [[pictures.get(tile) for tile in tiles] for _, tiles in rows]
     width = _MARGIN[0] + library.levels * TILE[0]
     height = _MARGIN[1] + len(rows) * TILE[1]
     figure = Figure(figsize=(width / _DPI, height / _DPI), dpi=_DPI, facecolor="white")
@@ -101,15 +101,22 @@ def draw(robot: Robot, library: TerrainLibrary) -> Figure:
     figure.subplots_adjust(
         _MARGIN[0] / width, 0.0, 1.0, 1 - _MARGIN[1] / height, wspace=0.015, hspace=0.02
     )
-    for axis, picture in zip(axes.ravel(), tiles, strict=True):
-        axis.axis("off")
-        if picture is not None:
-            axis.imshow(picture, aspect="auto")
+    for row, pictures in zip(axes, tiles, strict=True):
+        _fill(row, pictures)
     for level in range(library.levels):
         axes[0, level].set_title(f"level {level}", fontsize=12, pad=8)
     for axis, (label, _) in zip(axes[:, 0], rows, strict=True):
         axis.text(-0.06, 0.5, label, transform=axis.transAxes, ha="right", va="center", fontsize=12)
     return figure
+
+
+def _fill(axes: np.ndarray, pictures: list[np.ndarray | None]) -> None:
+    for axis, picture in zip(axes, pictures, strict=True):
+        axis.axis("off")
+        if picture is not None:
+            axis.imshow(picture, aspect="auto")
+    if pictures[-1] is None:
+        axes[1].text(0.06, 0.5, "the same at every level", va="center", fontsize=12, color="0.5")
 
 
 def _library(config: Config) -> TerrainLibrary:
@@ -139,6 +146,7 @@ def _render(robot: Robot, library: TerrainLibrary, tiles: set[int]) -> dict[int,
     model, pictures = scene.model, {}
     model.stat.extent = 3.0  # m: shadows and clipping planes reach as far as the picture
     model.light("sun").dir[:] = _SUN
+    model.light("sun").diffuse[:] = 0.85
     data = mujoco.MjData(model)
     with make_renderer(model, *TILE) as renderer:
         for tile in tiles:

@@ -16,9 +16,11 @@ WORLDS, SUBSTEPS = 4, 4
 class Drill:
     """The same start and the same targets for every simulation of four Solo-8."""
 
-    def __init__(self):
+    def __init__(self, library=None):
         self.robot = load_robot("solo8")
-        self.scene = build_scene(self.robot, timestep=0.005, solver_iterations=10, max_delay=3)
+        self.scene = build_scene(
+            self.robot, timestep=0.005, solver_iterations=10, max_delay=3, library=library
+        )
         frames = [torch.tensor(k.qpos) for k in self.robot.keyframes[:WORLDS]]
         self.qpos = torch.stack(frames).float()
         self.hold = self.qpos[:, 7:].clone()
@@ -69,6 +71,12 @@ class Drill:
 @pytest.fixture(scope="session")
 def drill():
     return Drill()
+
+
+@pytest.fixture(scope="session")
+def make_drill():
+    """Return a function that makes the drill for the tiles of a library."""
+    return Drill
 
 
 @pytest.fixture(scope="session")
