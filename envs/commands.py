@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 
+from kiras_rl.envs import rotations
 from kiras_rl.envs.randomness import UniformBuffer, scale_to
 from kiras_rl.envs.state import Task
 from kiras_rl.schema import CommandConfig, SkillConfig
@@ -15,6 +18,7 @@ COLUMNS = {
     "skill": 1,
     "skill_switch": 1,
     "start": 2,
+    "heading": 1,
 }
 """Random numbers that this module takes each step."""
 
@@ -51,10 +55,31 @@ class TaskSampler:
         """
         resample = self._chance("command_resample", self._commands.resample_probability)
         switch = self._chance("skill_switch", self._skills.switch_probability)
-        command = torch.where((reset | resample)[:, None], self.draw_command(), task.command)
+        renewed = reset | resample
+        command = torch.where(renewed[:, None], self.draw_command(), task.command)
+        heading = torch.where(renewed, self._draw_heading(command), task.heading)
         skill = torch.where(reset | switch, self.draw_skill(), task.skill)
         start = torch.where(reset, self.draw_start(skill), task.start)
-        return Task(command=command, skill=skill, start=start)
+        return Task(command=command, skill=skill, start=start, heading=heading)
+
+    def steer(self, task: Task, yaw: torch.Tensor) -> Task:
+        """Return the tasks with the yaw rates that hold their headings.
+
+        Args:
+            task: Tasks; some hold a heading.
+            yaw: Headings now, (N,), rad.
+        """
+        heading = torch.where(task.heading.isinf(), yaw, task.heading)
+        rate = self._commands.heading_gain * rotations.wrap(heading - yaw)
+        rate = rate.clamp(self._low[2], self._high[2])
+        command = task.command.clone()
+        command[:, 2] = torch.where(heading.isnan(), command[:, 2], rate)
+        return replace(task, command=command, heading=heading)
+
+    def _draw_heading(self, command: torch.Tensor) -> torch.Tensor:
+        """Return +inf, the heading of the moment, for some of the moving worlds, else NaN."""
+        holds = self._chance("heading", self._commands.heading_probability)
+        return torch.where(holds & command.any(dim=1), torch.inf, torch.nan)
 
     def draw_command(self) -> torch.Tensor:
         """Return new commands, (N, 3)."""

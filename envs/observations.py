@@ -15,7 +15,6 @@ from kiras_rl.config import ConfigError
 from kiras_rl.envs.lookup import find_function
 from kiras_rl.envs.state import Keyframes, RobotState, Task
 
-SCAN_POINTS = 63  # 9 x 7 heights around the base [paper]
 SCAN_LIMIT = 1.0  # m
 
 
@@ -110,8 +109,8 @@ def base_height(view: View) -> torch.Tensor:
 
 def height_scan(view: View) -> torch.Tensor:
     """Return base minus ground height at 9 x 7 points, relative to the first keyframe, 63, m."""
-    relative = view.robot.base_height - view.keyframes.height[0]
-    return relative.clamp(-SCAN_LIMIT, SCAN_LIMIT)[:, None].expand(-1, SCAN_POINTS)
+    relative = view.robot.height_scan() - view.keyframes.height[0]
+    return relative.clamp(-SCAN_LIMIT, SCAN_LIMIT)
 
 
 class ObservationGroup:

@@ -5,14 +5,15 @@ from __future__ import annotations
 import math
 import time
 
-import mujoco
 import torch
 from tensordict import TensorDict
 
 from kiras_rl import interfaces as names
-from kiras_rl.envs import commands, randomization, rotations, terminations
+from kiras_rl.envs import commands, curriculum, randomization, rotations, terminations
 from kiras_rl.envs.commands import TaskSampler
+from kiras_rl.envs.curriculum import CROSSED, Curriculum
 from kiras_rl.envs.description import describe_deployment
+from kiras_rl.envs.ground import Ground
 from kiras_rl.envs.kinematics import FootKinematics
 from kiras_rl.envs.model import Scene, build_scene
 from kiras_rl.envs.observations import View
@@ -21,7 +22,8 @@ from kiras_rl.envs.randomization import Randomizer
 from kiras_rl.envs.randomness import UniformBuffer, scale_to
 from kiras_rl.envs.rewards import RewardSum
 from kiras_rl.envs.simulation.base import Simulation
-from kiras_rl.envs.state import Keyframes, RobotState, Step, Task
+from kiras_rl.envs.state import CONTACT_FORCE, Keyframes, RobotState, Step, Task
+from kiras_rl.envs.terrain_library import TerrainLibrary, build_library
 from kiras_rl.interfaces import Measurements, SkillEnv
 from kiras_rl.robots.robot import Robot
 from kiras_rl.schema import EnvConfig, SimConfig
@@ -50,10 +52,15 @@ class QuadrupedEnv(SkillEnv):
         self.skills = robot.skills
         self.step_dt = sim_cfg.timestep * sim_cfg.substeps
         self.max_episode_length = round(cfg.terminations.episode_length / self.step_dt)
-        self._scene = _build_scene(robot, sim_cfg, cfg)
-        self.sim = _make_simulation(self._scene.model, sim_cfg, num_envs, backend, device)
+        self._library = build_library(cfg.terrain) if cfg.terrain else None
+        self._scene = _build_scene(robot, sim_cfg, cfg, self._library)
+        self.sim = _make_simulation(self._scene, sim_cfg, num_envs, backend, device)
         self.keyframes = Keyframes.of(robot, device)
         self.keyframe_height, self.keyframe_pitch = self.keyframes.height, self.keyframes.pitch
+        self._ground = None
+        if self._library:
+            self._ground = Ground(self._library, num_envs, device)
+            self.terrains, self.terrain_levels = self._library.types, self._library.levels
         self._allocate(robot)
         self._build_terms(seed)
         self._begin()
@@ -70,7 +77,7 @@ class QuadrupedEnv(SkillEnv):
         self._action_scale = tensor(robot.action_scale)
         self._all = torch.ones(n, dtype=torch.bool, device=device)
         index = torch.zeros(n, dtype=torch.int64, device=device)
-        self.task = Task(torch.zeros(n, 3, device=device), index, index.clone())
+        self.task = Task.of(torch.zeros(n, 3, device=device), index, index)
         self._held = False  # tasks set from outside stay until set again
         self._length = index.clone()
         self._action = torch.zeros(n, self.num_actions, device=device)
@@ -78,7 +85,7 @@ class QuadrupedEnv(SkillEnv):
         self._last_joint_torque = torch.zeros(n, self.num_actions, device=device)
         self._measurements: Measurements | None = None
         self._kinematics = FootKinematics(self._scene.model, robot, device)
-        self.robot = RobotState(self.sim, self._scene.sensors, self._kinematics)
+        self.robot = RobotState(self.sim, self._scene.sensors, self._kinematics, self._ground)
 
     def _build_terms(self, seed: int) -> None:
         cfg = self.cfg
@@ -90,11 +97,17 @@ class QuadrupedEnv(SkillEnv):
         generator.manual_seed(seed)
         columns = {"joint": self.num_actions, "velocity": 2, NOISE: self._observer.proprio.size}
         columns |= commands.COLUMNS | randomization.COLUMNS
+        if self._library:
+            columns |= curriculum.COLUMNS | {"yaw": 1}
         self._random = UniformBuffer(self.num_envs, columns, generator)
         self._tasks = TaskSampler(
             cfg.commands, cfg.skills, len(self.skills), self._random, self.device
         )
         self._randomizer = Randomizer(cfg.randomization, self._scene, self.sim, self._random)
+        self._curriculum = None
+        if self._library:
+            self._curriculum = Curriculum(self._library, len(self.skills), self._random)
+        self._placed: torch.Tensor | None = None  # tiles chosen from outside, (N,)
 
     def _begin(self) -> None:
         self.reset()
@@ -135,7 +148,8 @@ class QuadrupedEnv(SkillEnv):
 
         invalid = self.sim.diverged | self.sim.overflowed
         fallen = self._fallen() | invalid
-        time_outs = (self._length >= self.max_episode_length) & ~fallen
+        crossed = self._distance() > CROSSED
+        time_outs = ((self._length >= self.max_episode_length) | crossed) & ~fallen
         terms = self._judge(last_action, fallen, invalid)
         observer, view = self._observer, self._view()
         extras = {
@@ -148,8 +162,15 @@ class QuadrupedEnv(SkillEnv):
         self._measurements = self._measure(fallen)
 
         done = fallen | time_outs
+        if self._curriculum:
+            self._curriculum.record(self.task, self.robot, self.step_dt)
+            self._curriculum.update(done, fallen, crossed, self.task.skill)
         self._begin_next(done)
         return self._observe(done), terms.sum(dim=1), done, extras
+
+    def _distance(self) -> torch.Tensor:
+        """Return how far bases are from the middle of their tile, max(|x|, |y|), (N,), m."""
+        return self.robot.base_pos_w[:, :2].abs().amax(dim=1)
 
     def _joint_targets(self, action: torch.Tensor) -> torch.Tensor:
         return self._default_joint_pos + self._action_scale * action
@@ -186,19 +207,32 @@ class QuadrupedEnv(SkillEnv):
     def _begin_next(self, done: torch.Tensor) -> None:
         """Choose the next tasks, reset the worlds that ended and push some of the others."""
         if not self._held:
-            self.task = self._tasks.advance(self.task, done)
+            task = self._tasks.advance(self.task, done)
+            if self._curriculum:
+                self._curriculum.note_switches((task.skill != self.task.skill) & ~done)
+            self.task = task
         self._last_joint_torque = self.robot.joint_torque.clone()
         self._reset_worlds(done, self.task.start)
         push, velocity = self._randomizer.pushes(self.step_dt)
         qvel = self.sim.qvel.clone()
         qvel[:, :2] += velocity
         self.sim.write_velocity(push & ~done, qvel)
+        self._read_begin()
+
+    def _read_begin(self) -> None:
+        """Read where the next step begins, and steer from there."""
         self.robot.read_kinematics()
         self._last_joint_vel = self.robot.joint_vel.clone()
+        self.task = self._tasks.steer(self.task, self.robot.yaw)
 
     def _reset_worlds(self, mask: torch.Tensor, start: torch.Tensor) -> None:
-        """Put the masked worlds into the keyframes `start`, (N,), with new physics."""
+        """Put the masked worlds into the keyframes `start`, (N,), with new physics and ground."""
         self._randomizer.reset(mask)
+        if self._curriculum:
+            placed = self._placed is not None
+            self._write_terrain(
+                mask, self._placed if placed else self._curriculum.tiles(self.task.skill)
+            )
         qpos, qvel = self._initial_state(start)
         joint_pos = qpos[:, 7:]
         self.sim.write_state(mask, qpos, qvel, joint_pos)
@@ -208,6 +242,10 @@ class QuadrupedEnv(SkillEnv):
         self._last_joint_torque = torch.where(mask[:, None], 0.0, self._last_joint_torque)
         self._length = torch.where(mask, 0, self._length)
 
+    def _write_terrain(self, mask: torch.Tensor, tile: torch.Tensor) -> None:
+        self._ground.write(mask, tile)
+        self.sim.write_terrain(mask, tile)
+
     def _initial_state(self, start: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Return qpos (N, 7 + J) and qvel (N, 6 + J) near the keyframes `start`."""
         frames, skills = self.keyframes, self.cfg.skills
@@ -216,9 +254,13 @@ class QuadrupedEnv(SkillEnv):
         joint_pos = frames.joint_pos[start] + scale_to(self._random["joint"], -noise, noise)
         qpos = torch.zeros(n, 7 + self.num_actions, device=self.device)
         pitch = frames.pitch[start]
-        qpos[:, 3:7] = rotations.quat_from_pitch_yaw(pitch, torch.zeros_like(pitch))
-        qpos[:, 7:] = joint_pos
+        yaw = torch.zeros_like(pitch)
         qpos[:, 2] = SPAWN_CLEARANCE - self._kinematics.lowest_foot(pitch, joint_pos)
+        if self._ground:  # on the platform in the middle, with any heading
+            yaw = scale_to(self._random["yaw"][:, 0], -math.pi, math.pi)
+            qpos[:, 2] += self._ground.spawn_height
+        qpos[:, 3:7] = rotations.quat_from_pitch_yaw(pitch, yaw)
+        qpos[:, 7:] = joint_pos
         qvel = torch.zeros(n, 6 + self.num_actions, device=self.device)
         speed = skills.velocity_noise
         qvel[:, :2] = scale_to(self._random["velocity"], -speed, speed)
@@ -241,6 +283,8 @@ class QuadrupedEnv(SkillEnv):
             lin_vel_h=robot.base_lin_vel_h,
             yaw_rate=robot.yaw_rate,
             foot_contact=robot.foot_contact,
+            limb_contact=(robot.limb_force > CONTACT_FORCE).any(dim=1),
+            distance=self._distance(),
             fallen=fallen,
         )
 
@@ -256,7 +300,7 @@ class QuadrupedEnv(SkillEnv):
         log["Sim/diverged"] = self.sim.diverged.float().sum()
         log["Sim/overflowed"] = self.sim.overflowed.float().sum()
         log["Perf/physics_time"] = torch.tensor(self._physics_time)
-        return log
+        return log | (self._curriculum.describe(self.skills) if self._curriculum else {})
 
     # --- the rest of SkillEnv -----------------------------------------------------------------
 
@@ -278,7 +322,10 @@ class QuadrupedEnv(SkillEnv):
         self._random.generator.manual_seed(seed)
 
     def reset(
-        self, skill: torch.Tensor | None = None, command: torch.Tensor | None = None
+        self,
+        skill: torch.Tensor | None = None,
+        command: torch.Tensor | None = None,
+        hold_heading: bool = False,
     ) -> TensorDict:
         """Reset every world; a given skill starts at its own keyframe and stays."""
         self._random.refill()
@@ -287,16 +334,27 @@ class QuadrupedEnv(SkillEnv):
         start = task.start if skill is None else skill
         skill = task.skill if skill is None else skill
         command = task.command if command is None else command
-        self.task = Task(command=command.clone(), skill=skill.clone(), start=start.clone())
+        heading = task.heading.clone().fill_(math.inf if hold_heading else math.nan)
+        given = command is not task.command or hold_heading
+        self.task = Task(
+            command=command.clone(),
+            skill=skill.clone(),
+            start=start.clone(),
+            heading=heading if given else task.heading,
+        )
         self._reset_worlds(self._all, self.task.start)
-        self.robot.read_kinematics()
-        self._last_joint_vel = self.robot.joint_vel.clone()
+        self._read_begin()
         return self._observe(self._all)
+
+    def place(self, terrain: torch.Tensor, level: torch.Tensor) -> None:
+        """Choose the ground of every world; variants are dealt in turn."""
+        variant = torch.arange(self.num_envs, device=self.device) % self._library.variants
+        self._placed = self._library.index(terrain, level, variant)
 
     def set_task(self, skill: torch.Tensor, command: torch.Tensor) -> TensorDict:
         """Give every world a new skill and command, which stay until the next call."""
         self._held = True
-        self.task = Task(command=command.clone(), skill=skill.clone(), start=self.task.start)
+        self.task = Task.of(command, skill, self.task.start)
         return self._observer.change_task(self._view())
 
     def set_skill_probabilities(self, probabilities: torch.Tensor) -> None:
@@ -325,7 +383,7 @@ class QuadrupedEnv(SkillEnv):
     def _at_rest(self, skill: torch.Tensor, command: torch.Tensor) -> View:
         robot = RobotState.at_rest(self.keyframes, skill, len(self.robot_cfg.foot_geoms))
         action = (robot.joint_pos - self._default_joint_pos) / self._action_scale
-        task = Task(command.to(self.device), skill, skill)
+        task = Task.of(command.to(self.device), skill, skill)
         return View(robot, task, self.keyframes, self._default_joint_pos, action)
 
     def describe(self) -> dict:
@@ -342,6 +400,8 @@ class QuadrupedEnv(SkillEnv):
             "generator": self._random.generator.get_state(),
             "observer": self._observer.state_dict(),
             "buffers": {name: getattr(self, name) for name in _BUFFERS},
+            "curriculum": self._curriculum.state_dict() if self._curriculum else {},
+            "tile": self._ground.tile if self._ground else None,
         }
 
     def load_state_dict(self, state: dict) -> None:
@@ -354,6 +414,9 @@ class QuadrupedEnv(SkillEnv):
         for name in _BUFFERS:
             setattr(self, name, state["buffers"][name].to(self.device))
         self._observer.load_state_dict(state["observer"])
+        if self._curriculum:
+            self._curriculum.load_state_dict(state["curriculum"])
+            self._ground.write(self._all, state["tile"].to(self.device))
         self.robot.read_kinematics()
 
 
@@ -370,29 +433,38 @@ def _unless(mask: torch.Tensor, new: torch.Tensor, old: torch.Tensor) -> torch.T
     return torch.where(mask[:, None], old, new)
 
 
-def _build_scene(robot: Robot, sim_cfg: SimConfig, cfg: EnvConfig) -> Scene:
+def _build_scene(
+    robot: Robot, sim_cfg: SimConfig, cfg: EnvConfig, library: TerrainLibrary | None
+) -> Scene:
     delay = cfg.randomization.action_delay
     return build_scene(
-        robot, sim_cfg.timestep, sim_cfg.solver_iterations, max_delay=delay[1] if delay else 0
+        robot,
+        sim_cfg.timestep,
+        sim_cfg.solver_iterations,
+        max_delay=delay[1] if delay else 0,
+        library=library,
     )
 
 
 def _make_simulation(
-    model: mujoco.MjModel, sim_cfg: SimConfig, num_worlds: int, backend: str, device: torch.device
+    scene: Scene, sim_cfg: SimConfig, num_worlds: int, backend: str, device: torch.device
 ) -> Simulation:
     if backend == "native":
         from kiras_rl.envs.simulation.native import NativeSimulation
 
-        return NativeSimulation(model, num_worlds, sim_cfg.substeps, sim_cfg.threads)
+        return NativeSimulation(
+            scene.model, num_worlds, sim_cfg.substeps, sim_cfg.threads, scene.terrain
+        )
     # Imported late: it takes seconds, and a CPU user never needs it.
     from kiras_rl.envs.simulation.warp import WarpSimulation
 
     return WarpSimulation(
-        model,
+        scene.model,
         num_worlds,
         sim_cfg.substeps,
         device,
         max_contacts=sim_cfg.max_contacts,
         max_constraints=sim_cfg.max_constraints,
         max_ccd=sim_cfg.max_ccd,
+        terrain=scene.terrain,
     )

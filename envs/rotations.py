@@ -27,6 +27,32 @@ def rotate_inverse(quat: torch.Tensor, vector: torch.Tensor) -> torch.Tensor:
     return vector - w * t + torch.linalg.cross(u, t)
 
 
+def rotate(quat: torch.Tensor, vector: torch.Tensor) -> torch.Tensor:
+    """Express vectors (N, ..., 3) of the frames of `quat` (N, 4) in the world."""
+    quat = quat.view(len(quat), *[1] * (vector.dim() - 2), 4)
+    w, u = quat[..., :1], quat[..., 1:].expand_as(vector)
+    t = 2.0 * torch.linalg.cross(u, vector)
+    return vector + w * t + torch.linalg.cross(u, t)
+
+
+def yaw(quat: torch.Tensor) -> torch.Tensor:
+    """Return the heading of the x axis of `quat` (N, 4), (N,), rad."""
+    w, x, y, z = quat.unbind(-1)
+    return torch.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+
+
+def wrap(angle: torch.Tensor) -> torch.Tensor:
+    """Return the angle in [-pi, pi)."""
+    return torch.remainder(angle + torch.pi, 2.0 * torch.pi) - torch.pi
+
+
+def turn(points: torch.Tensor, yaw: torch.Tensor) -> torch.Tensor:
+    """Rotate horizontal points (P, 2) by each yaw (N,), (N, P, 2)."""
+    cos, sin = torch.cos(yaw)[:, None], torch.sin(yaw)[:, None]
+    x, y = points[:, 0], points[:, 1]
+    return torch.stack([cos * x - sin * y, sin * x + cos * y], dim=-1)
+
+
 def to_heading_frame(quat: torch.Tensor, vector: torch.Tensor) -> torch.Tensor:
     """Rotate world vectors (N, 3) by minus the yaw of `quat` (N, 4)."""
     w, x, y, z = quat.unbind(-1)

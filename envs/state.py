@@ -11,12 +11,16 @@ from dataclasses import dataclass
 import torch
 
 from kiras_rl.envs import rotations
+from kiras_rl.envs.ground import Ground
 from kiras_rl.envs.kinematics import FootKinematics
 from kiras_rl.envs.model import SensorLayout
 from kiras_rl.envs.simulation.base import Simulation
 from kiras_rl.robots.robot import Robot
 
 CONTACT_FORCE = 1.0  # N; a foot that presses harder than this stands
+PATCH_SPACING = 0.1  # m between the points whose mean is the ground under the base
+SCAN_SHAPE = (9, 7)  # points of the height scan, forward and to the left [paper: 63]
+SCAN_SPACING = 0.1  # m between them
 
 
 class RobotState:
@@ -26,11 +30,20 @@ class RobotState:
     push changed. Contacts, velocities of the feet and torques keep the values of the step.
     """
 
-    def __init__(self, sim: Simulation, layout: SensorLayout, kinematics: FootKinematics) -> None:
-        """Bind to a simulation."""
+    def __init__(
+        self,
+        sim: Simulation,
+        layout: SensorLayout,
+        kinematics: FootKinematics,
+        ground: Ground | None = None,
+    ) -> None:
+        """Bind to a simulation; without a `ground` it is flat."""
         self._sim = sim
         self._layout = layout
         self._kinematics = kinematics
+        self._ground = ground
+        self._patch = grid(3, 3, PATCH_SPACING).to(sim.device)
+        self._scan = grid(*SCAN_SHAPE, SCAN_SPACING).to(sim.device)
         self.read_kinematics()
         self._read_contacts()
 
@@ -49,6 +62,9 @@ class RobotState:
         robot.joint_pos = keyframes.joint_pos[skill]
         robot.joint_vel = torch.zeros_like(robot.joint_pos)
         robot._foot_height = torch.zeros(len(skill), num_feet, device=skill.device)
+        robot.base_pos_w = torch.zeros_like(zero)
+        robot.base_pos_w[:, 2] = robot.base_height
+        robot._ground = None
         return robot
 
     def read_step(self) -> None:
@@ -60,8 +76,8 @@ class RobotState:
         """Read what follows from positions and velocities alone."""
         qpos, qvel = self._sim.qpos, self._sim.qvel
         self.base_pos_w = qpos[:, :3]  # (N, 3), m
-        self.base_height = qpos[:, 2]  # above the ground under the base, (N,), m
         self.base_quat_w = quat = qpos[:, 3:7]  # (N, 4)
+        self.base_height = self._height_above_ground()  # of the base's origin, (N,), m
         self.base_ang_vel_b = qvel[:, 3:6]  # (N, 3), rad/s
         self.base_lin_vel_b = rotations.rotate_inverse(quat, qvel[:, :3])  # (N, 3), m/s
         self.base_lin_vel_h = rotations.to_heading_frame(quat, qvel[:, :3])  # (N, 3), m/s
@@ -78,8 +94,38 @@ class RobotState:
         """Height of the lowest point of each foot above the ground, (N, F), m."""
         if self._foot_height is None:  # not every step asks for it
             below = self._kinematics.foot_height_b(self.gravity_b, self.joint_pos)
-            self._foot_height = self.base_height[:, None] + below
+            self._foot_height = self.base_pos_w[:, 2:] + below - self._ground_under_feet()
         return self._foot_height
+
+    @property
+    def yaw(self) -> torch.Tensor:
+        """Heading of the base, (N,), rad."""
+        return rotations.yaw(self.base_quat_w)
+
+    def height_scan(self) -> torch.Tensor:
+        """Return how far the base is above SCAN_SHAPE points around it, (N, points), m.
+
+        The points lie SCAN_SPACING apart in the heading frame.
+        """
+        if self._ground is None:
+            return self.base_pos_w[:, 2:].expand(-1, SCAN_SHAPE[0] * SCAN_SHAPE[1])
+        points = self.base_pos_w[:, None, :2] + rotations.turn(self._scan, self.yaw)
+        return self.base_pos_w[:, 2:] - self._ground.heights(points)
+
+    def _height_above_ground(self) -> torch.Tensor:
+        """Return the height above the mean of 3 x 3 points PATCH_SPACING apart, (N,), m."""
+        if self._ground is None:
+            return self.base_pos_w[:, 2]
+        points = self.base_pos_w[:, None, :2] + self._patch
+        return self.base_pos_w[:, 2] - self._ground.heights(points).mean(dim=1)
+
+    def _ground_under_feet(self) -> torch.Tensor:
+        """Return the height of the ground under each foot, (N, F), m; 0 where it is flat."""
+        if self._ground is None:
+            return torch.zeros_like(self.base_pos_w[:, :1])
+        pos_b = self._kinematics.foot_pos_b(self.joint_pos)
+        points = self.base_pos_w[:, None] + rotations.rotate(self.base_quat_w, pos_b)
+        return self._ground.heights(points[..., :2])
 
     def _read_contacts(self) -> None:
         record, layout = self._sim.sensor_record, self._layout
@@ -101,11 +147,20 @@ class Task:
         command: v_x, v_y in the heading frame and yaw rate, (N, 3), m/s and rad/s.
         skill: Index of the commanded skill, (N,) int64.
         start: Index of the keyframe where the episode began, (N,) int64.
+        heading: Heading that the commanded yaw rate holds, (N,), rad; NaN for none, +inf for that
+            of the moment.
     """
 
     command: torch.Tensor
     skill: torch.Tensor
     start: torch.Tensor
+    heading: torch.Tensor
+
+    @classmethod
+    def of(cls, command: torch.Tensor, skill: torch.Tensor, start: torch.Tensor) -> Task:
+        """Copy commands, skills and starts; no heading is held."""
+        heading = torch.full_like(command[:, 0], torch.nan)
+        return cls(command.clone(), skill.clone(), start.clone(), heading)
 
 
 @dataclass(frozen=True)
@@ -170,6 +225,13 @@ class Step:
     fresh: torch.Tensor
     fallen: torch.Tensor
     dt: float
+
+
+def grid(rows: int, columns: int, spacing: float) -> torch.Tensor:
+    """Return points around the origin, x by rows, y by columns, (rows * columns, 2), m."""
+    x = spacing * (torch.arange(rows) - (rows - 1) / 2)
+    y = spacing * (torch.arange(columns) - (columns - 1) / 2)
+    return torch.cartesian_prod(x, y)
 
 
 def _force(flat: torch.Tensor) -> torch.Tensor:

@@ -15,7 +15,13 @@ CFG_FOLDER = Path(__file__).resolve().parent / "cfg"
 if not CFG_FOLDER.is_dir():  # an editable install: kiras_rl.cfg is the top-level folder cfg/
     CFG_FOLDER = Path(__file__).resolve().parents[1] / "cfg"
 
-RESUME_OVERRIDES = ("iterations", "device", "sim.threads", "checkpoint_minutes")
+RESUME_OVERRIDES = (
+    "iterations",
+    "finetuning.iterations",
+    "device",
+    "sim.threads",
+    "checkpoint_minutes",
+)
 """Keys that may change when a run is resumed: none of them changes what was learned so far."""
 
 
@@ -43,6 +49,15 @@ def config_from_dict(values: dict, overrides: list[str] | tuple[str, ...] = ()) 
         ConfigError: As `load_config`.
     """
     return _resolve([values], list(overrides), source="the saved configuration")
+
+
+def config_from_layers(layers: list[dict], source: str) -> Config:
+    """Merge a whole configuration and changes to it; `source` names them in errors.
+
+    Raises:
+        ConfigError: As `load_config`.
+    """
+    return _resolve(layers, [], source)
 
 
 def config_to_dict(config: Config) -> dict:

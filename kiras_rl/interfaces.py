@@ -61,6 +61,8 @@ class Measurements:
         lin_vel_h: Base velocity in the heading frame, (N, 3), m/s.
         yaw_rate: rad/s about the vertical.
         foot_contact: Feet on the ground, (N, F) bool.
+        limb_contact: Worlds where a thigh or shank touched the ground, bool.
+        distance: How far the base is from the middle of its tile, the larger of |x| and |y|, m.
         fallen: Worlds that terminate by failure at this step, bool.
     """
 
@@ -70,6 +72,8 @@ class Measurements:
     lin_vel_h: torch.Tensor
     yaw_rate: torch.Tensor
     foot_contact: torch.Tensor
+    limb_contact: torch.Tensor
+    distance: torch.Tensor
     fallen: torch.Tensor
 
 
@@ -98,19 +102,39 @@ class SkillEnv(VecEnv):
     keyframe_pitch: torch.Tensor
     """Pitch of each keyframe, (S,), rad."""
 
+    terrains: tuple[str, ...] = ()
+    """Names of the terrain types; none where all ground is flat."""
+
+    terrain_levels: int = 0
+    """Difficulty levels of each type."""
+
     @abstractmethod
     def seed(self, seed: int) -> None:
         """Restart the environment's random numbers."""
 
     @abstractmethod
     def reset(
-        self, skill: torch.Tensor | None = None, command: torch.Tensor | None = None
+        self,
+        skill: torch.Tensor | None = None,
+        command: torch.Tensor | None = None,
+        hold_heading: bool = False,
     ) -> TensorDict:
         """Reset every world.
 
         Args:
             skill: Skill index to start and stay in, (N,), or None to draw it.
             command: Command, (N, 3), or None to draw it.
+            hold_heading: Command the yaw rate that keeps the heading of the start, in place of
+                the third number of `command`.
+        """
+
+    @abstractmethod
+    def place(self, terrain: torch.Tensor, level: torch.Tensor) -> None:
+        """Choose the ground of every world, from its next reset on and for good.
+
+        Args:
+            terrain: Index into `terrains`, (N,).
+            level: Difficulty level, (N,).
         """
 
     @abstractmethod

@@ -27,6 +27,7 @@ POSITIVE = (
     "learner.imitation.premium.per_iteration",
     "learner.estimator.epochs",
     "evaluation.worlds_per_skill",
+    "finetuning.iterations",
 )
 
 SCHEDULES = (

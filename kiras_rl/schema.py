@@ -52,6 +52,8 @@ class CommandConfig:
     ang_vel_z: tuple[float, float]
     zero_probability: float
     resample_probability: float
+    heading_probability: float
+    heading_gain: float
 
 
 @dataclass
@@ -224,6 +226,15 @@ class LearnerConfig:
 
 
 @dataclass
+class TerrainEvaluationConfig:
+    """The evaluation on terrain."""
+
+    robots: int
+    level: int
+    command: float
+
+
+@dataclass
 class EvaluationConfig:
     """The deterministic evaluation beside the training."""
 
@@ -231,6 +242,16 @@ class EvaluationConfig:
     worlds_per_skill: int
     duration: float
     command: float
+    terrain: TerrainEvaluationConfig
+
+
+@dataclass
+class FinetuningConfig:
+    """Terrain finetuning, the second phase."""
+
+    iterations: int
+    residual_weight: float
+    changes: dict[str, Any]
 
 
 @dataclass
@@ -246,4 +267,5 @@ class Config:
     sim: SimConfig
     env: EnvConfig
     learner: LearnerConfig
+    finetuning: FinetuningConfig | None
     evaluation: EvaluationConfig

@@ -19,6 +19,7 @@ from rich.table import Table
 from kiras_rl.config import ConfigError, load_config
 from kiras_rl.envs.model import Scene, build_scene
 from kiras_rl.envs.terrain_library import TerrainLibrary, build_library
+from kiras_rl.phases import FINETUNING, phase_config
 from kiras_rl.robots.robot import Robot, RobotError, load_robot
 from kiras_rl.schema import Config
 from kiras_rl.tools.rendering import RenderError, make_renderer
@@ -45,7 +46,8 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("overrides", nargs="*", metavar="key=value", help="of the configuration")
     arguments = parser.parse_args(argv)
     try:
-        config = load_config(arguments.cfg, [f"robot={arguments.robot}", *arguments.overrides])
+        whole = load_config(arguments.cfg, [f"robot={arguments.robot}", *arguments.overrides])
+        config = phase_config(whole, FINETUNING)
         robot = load_robot(config.robot)
         library = _library(config)
     except (ConfigError, RobotError) as error:
@@ -121,7 +123,9 @@ def _fill(axes: np.ndarray, pictures: list[np.ndarray | None]) -> None:
 
 def _library(config: Config) -> TerrainLibrary:
     if config.env.terrain is None:
-        raise ConfigError("env.terrain=null: this configuration has no terrain, try --cfg base")
+        raise ConfigError(
+            "this configuration has no terrain: neither finetuning nor env.terrain; try --cfg base"
+        )
     return build_library(config.env.terrain)
 
 

@@ -9,6 +9,7 @@ from tensordict import TensorDict
 from kiras_rl import interfaces as names
 from kiras_rl.config import load_config
 from kiras_rl.interfaces import SkillEnv
+from kiras_rl.phases import SKILL_LEARNING
 from kiras_rl.runner import KirasRunner
 
 SMALL = (
@@ -23,6 +24,7 @@ SMALL = (
     "learner.imitation.discriminator.batch_size=64",
     "learner.imitation.premium.window=6",
     "iterations=10",
+    "finetuning.iterations=10",
 )
 
 
@@ -88,16 +90,16 @@ class CountingEnv(SkillEnv):
     def unused(self, *args):
         raise NotImplementedError
 
-    seed = reset = set_task = measure = describe = state_dict = load_state_dict = unused
+    seed = reset = place = set_task = measure = describe = state_dict = load_state_dict = unused
 
 
 @pytest.fixture
 def make_runner():
     """Return a function that builds a small learner of counting worlds, with overrides."""
 
-    def make(*overrides, num_envs=16):
+    def make(*overrides, num_envs=16, phase=SKILL_LEARNING):
         torch.manual_seed(1)
         config = load_config("base", [*SMALL, *overrides])
-        return KirasRunner(CountingEnv(num_envs), config, None, "cpu")
+        return KirasRunner(CountingEnv(num_envs), config, None, "cpu", phase=phase)
 
     return make

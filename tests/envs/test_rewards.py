@@ -45,7 +45,7 @@ def crafted(command=(0.5, 0.0, 0.2), fresh=False, fallen=False):
     robot.limb_force = row(0.05, 3.0)
     return Step(
         robot=robot,
-        task=Task(row(*command), torch.tensor([CRAWL]), torch.tensor([WALK])),
+        task=Task.of(row(*command), torch.tensor([CRAWL]), torch.tensor([WALK])),
         keyframes=KEYFRAMES,
         action=row(1.0, 2.0),
         last_action=row(-2.0, 6.0),

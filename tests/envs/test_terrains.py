@@ -13,8 +13,9 @@ from kiras_rl.envs.ground import Ground
 from kiras_rl.envs.terrain_geoms import add_terrain, terrain_geoms
 from kiras_rl.envs.terrain_library import build_library
 from kiras_rl.envs.terrains import Draw
+from kiras_rl.phases import FINETUNING, phase_config
 
-CONFIG = load_config("base").env.terrain
+CONFIG = phase_config(load_config("base"), FINETUNING).env.terrain
 LEVELS = range(CONFIG.levels)
 
 
@@ -274,5 +275,6 @@ def refusal(config):
 
 @pytest.mark.parametrize("key", ["levels", "variants", "scale", "cell"])
 def test_sizes_are_positive(key):
+    config = load_config("base", [f"finetuning.changes.env.terrain.{key}=0"])
     with pytest.raises(ConfigError, match=f"env.terrain.{key}=0.*: must be positive"):
-        load_config("base", [f"env.terrain.{key}=0"])
+        phase_config(config, FINETUNING)

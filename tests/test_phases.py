@@ -1,0 +1,75 @@
+"""The two phases of a run: what each makes of its configuration."""
+
+from __future__ import annotations
+
+import pytest
+
+from kiras_rl.config import ConfigError, config_to_dict, load_config
+from kiras_rl.phases import (
+    FINETUNING,
+    SKILL_LEARNING,
+    phase_config,
+    phases_of,
+    total_iterations,
+)
+
+
+def changed(one, other, prefix=""):
+    """List the dotted keys in which two nested dictionaries differ."""
+    keys = []
+    for key in one.keys() | other.keys():
+        a, b = one.get(key), other.get(key)
+        if isinstance(a, dict) and isinstance(b, dict):
+            keys += changed(a, b, f"{prefix}{key}.")
+        elif a != b:
+            keys.append(prefix + key)
+    return sorted(keys)
+
+
+def test_the_paper_s_phases_are_the_default():
+    config = load_config("solo8")
+    assert phases_of(config) == (SKILL_LEARNING, FINETUNING)
+    assert (config.num_envs, config.iterations) == (4096, 6000)
+    assert phase_config(config, FINETUNING).iterations == 30000
+    assert total_iterations(config) == 36000
+
+
+def test_skill_learning_is_the_run_without_finetuning():
+    config = load_config("solo8")
+    alone = phase_config(config, SKILL_LEARNING)
+    assert changed(config_to_dict(config), config_to_dict(alone)) == ["finetuning"]
+    assert alone.env.terrain is None
+
+
+def test_finetuning_has_its_changes_and_no_imitation():
+    overrides = ["finetuning.changes.env.terrain.scale=1.5", "finetuning.changes.num_envs=7"]
+    alone = phase_config(load_config("solo8", overrides), FINETUNING)
+    assert alone.learner.imitation is None
+    assert alone.learner.multi_critic is None
+    assert alone.finetuning is None
+    assert alone.num_envs == 7
+    assert alone.env.terrain.scale == 1.5
+    assert list(alone.env.terrain.types) == ["flat", "slopes", "bars", "footholds", "stairs"]
+
+
+def test_a_run_may_leave_finetuning_out():
+    config = load_config("solo8_quick")
+    assert phases_of(config) == (SKILL_LEARNING,)
+    assert total_iterations(config) == config.iterations
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("env.terrrain.scale=1", "unknown key 'env.terrrain'; did you mean 'env.terrain'?"),
+        ("env.terrain.scale=big", "env.terrain.scale: Value 'big' of type 'str'"),
+        ("num_envs=0", "in finetuning.changes: num_envs=0: must be positive"),
+    ],
+)
+def test_a_change_that_cannot_be_is_one_clear_line(override, message):
+    config = load_config("solo8", [f"finetuning.changes.{override}"])
+    with pytest.raises(ConfigError) as caught:
+        phase_config(config, FINETUNING)
+    assert message in str(caught.value)
+    assert "finetuning.changes" in str(caught.value)
+    assert "\n" not in str(caught.value)
