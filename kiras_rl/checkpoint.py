@@ -13,9 +13,10 @@ import torch
 from kiras_rl import __version__
 from kiras_rl.models.exported import ExportedPolicy, build_policy
 
-FORMAT = 1
+FORMAT = 2
 FOLDER = "checkpoints"
 LATEST, BEST = "latest.pt", "best.pt"
+FLAT = "flat.pt"  # the best of skill learning, once finetuning has begun
 
 # What torch.load raises on files that are no zip archives of tensors, truncated, or hold code.
 _UNREADABLE = (

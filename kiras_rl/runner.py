@@ -21,9 +21,9 @@ from kiras_rl.config import config_to_dict
 from kiras_rl.deploy.metadata import FORMAT as METADATA_FORMAT
 from kiras_rl.evaluation import Policy, SkillResult, as_scalars, score
 from kiras_rl.interfaces import SkillEnv
+from kiras_rl.phases import FINETUNING, SKILL_LEARNING, phase_config, total_iterations
 from kiras_rl.schema import Config
-
-Evaluate = Callable[[Policy], dict[str, SkillResult]]
+from kiras_rl.terrain_evaluation import TerrainResult
 
 
 class TrainingError(ValueError):
@@ -35,24 +35,44 @@ class Status:
     """What a progress line shows after an iteration.
 
     Attributes:
-        iteration: Iterations done.
+        phase: Name of the phase, see kiras_rl.phases.
+        iteration: Iterations done, over all phases.
         iterations: Iterations in all.
         steps: Environment steps done.
         seconds: Wall time of this iteration.
         scalars: Everything that was logged for it.
-        evaluation: The latest deterministic evaluation, empty before the first.
+        evaluation: The latest deterministic evaluation on flat ground, empty before the first.
+        terrain: The latest one on terrain, None where there is none.
     """
 
+    phase: str
     iteration: int
     iterations: int
     steps: int
     seconds: float
     scalars: dict[str, float]
     evaluation: dict[str, SkillResult]
+    terrain: TerrainResult | None
+
+
+@dataclass(frozen=True)
+class Evaluators:
+    """Judges of a policy without action noise; None where one is not wanted.
+
+    Attributes:
+        flat: Every skill on flat ground.
+        terrain: Every skill on every terrain.
+    """
+
+    flat: Callable[[Policy], dict[str, SkillResult]] | None = None
+    terrain: Callable[[Policy], TerrainResult] | None = None
 
 
 class KirasRunner(OnPolicyRunner):
-    """rsl-rl's runner with a phase clock, self-contained checkpoints and one log per rollout."""
+    """rsl-rl's runner for one phase, with self-contained checkpoints and one log per rollout.
+
+    `current_learning_iteration` counts over all phases.
+    """
 
     alg: KirasPPO
     env: SkillEnv
@@ -63,25 +83,33 @@ class KirasRunner(OnPolicyRunner):
         config: Config,
         run_dir: Path | None,
         device: str,
-        evaluate: Evaluate | None = None,
+        evaluators: Evaluators | None = None,
         commit: str = "unknown",
+        phase: str = SKILL_LEARNING,
     ) -> None:
-        """Build the learner.
+        """Build the learner of a phase.
 
         Args:
             env: The training environment.
-            config: The run.
+            config: The run, all its phases.
             run_dir: Folder of the run; None writes nothing.
             device: Of the networks.
-            evaluate: Judges a policy without action noise; called every evaluation.interval.
+            evaluators: Judge a policy without action noise, every evaluation.interval.
             commit: Of the source, for the provenance of the policy.
+            phase: Which phase to train.
         """
         torch.manual_seed(config.seed)
-        self.config, self.run_dir = config, run_dir
-        super().__init__(env, _rsl_rl_config(config), log_dir=None, device=device)
-        self.evaluate, self.commit = evaluate, commit
+        self.config, self.run_dir, self.phase = config, run_dir, phase
+        settings = _rsl_rl_config(config, phase, env.step_dt)
+        super().__init__(env, settings, log_dir=None, device=device)
+        self._first = 0 if phase == SKILL_LEARNING else config.iterations
+        self._last = self._first + settings["iterations"]
+        self.current_learning_iteration = self._first
+        self.evaluators, self.commit = evaluators or Evaluators(), commit
         self.evaluation: dict[str, SkillResult] = {}
+        self.terrain: TerrainResult | None = None
         self.best_score = float("inf")
+        self.best_networks: dict | None = None
         self.seconds = 0.0  # of training, over all resumes
         self._writer: SummaryWriter | None = None
         self._last_saved = time.monotonic()
@@ -94,7 +122,7 @@ class KirasRunner(OnPolicyRunner):
         init_at_random_ep_len: bool = False,
         on_iteration: Callable[[Status], None] | None = None,
     ) -> bool:
-        """Train until `iterations` are done or the process is asked to stop.
+        """Train until the phase is done or the process is asked to stop.
 
         SIGINT and SIGTERM let the iteration end, save, and return.
 
@@ -104,14 +132,13 @@ class KirasRunner(OnPolicyRunner):
             on_iteration: Called after each iteration.
 
         Returns:
-            Whether all iterations are done.
+            Whether all iterations of the phase are done.
         """
         if init_at_random_ep_len:
             raise ValueError("set env.terminations.random_first_length instead")
-        total = self.config.iterations
-        last = total
+        last = self._last
         if num_learning_iterations is not None:
-            last = min(total, self.current_learning_iteration + num_learning_iterations)
+            last = min(last, self.current_learning_iteration + num_learning_iterations)
         self._open_log()
         with StopRequest() as stop:
             while self.current_learning_iteration < last and not stop.requested:
@@ -120,9 +147,12 @@ class KirasRunner(OnPolicyRunner):
                     on_iteration(status)
                 if time.monotonic() - self._last_saved > 60.0 * self.config.checkpoint_minutes:
                     self.save_latest()
+            finished = self.current_learning_iteration >= self._last
+            if finished and self.best_networks is None:  # nothing was evaluated
+                self.best_networks = self.alg.networks()
             self.save_latest()
         self._close_log()
-        return self.current_learning_iteration >= total
+        return finished
 
     def _iterate(self) -> Status:
         begin = time.perf_counter()
@@ -146,12 +176,14 @@ class KirasRunner(OnPolicyRunner):
         self.seconds += seconds
         self._write(scalars)
         return Status(
+            phase=self.phase,
             iteration=self.current_learning_iteration,
-            iterations=self.config.iterations,
+            iterations=total_iterations(self.config),
             steps=steps * self.current_learning_iteration,
             seconds=seconds,
             scalars=scalars,
             evaluation=self.evaluation,
+            terrain=self.terrain,
         )
 
     def _rollout(self) -> dict[str, torch.Tensor]:
@@ -197,19 +229,27 @@ class KirasRunner(OnPolicyRunner):
 
     def _evaluate_when_due(self) -> dict[str, float]:
         interval, done = self.config.evaluation.interval, self.current_learning_iteration
-        is_due = interval and (done % interval == 0 or done == self.config.iterations)
-        if not self.evaluate or not is_due:
+        if not self.evaluators.flat or not interval or (done % interval and done != self._last):
             return {}
         begin = time.perf_counter()
         with single_threaded(self.device):
-            self.evaluation = self.evaluate(self.alg.act_deterministic)
-        scalars = as_scalars(self.evaluation) | {
-            "Perf/evaluation_time": time.perf_counter() - begin
-        }
-        if score(self.evaluation) < self.best_score:
-            self.best_score = score(self.evaluation)
+            self.evaluation = self.evaluators.flat(self.alg.act_deterministic)
+            if self.evaluators.terrain:
+                self.terrain = self.evaluators.terrain(self.alg.act_deterministic)
+        scalars = as_scalars(self.evaluation)
+        if self.terrain:
+            scalars |= self.terrain.as_scalars()
+        self._keep_best()
+        return scalars | {"Perf/evaluation_time": time.perf_counter() - begin}
+
+    def _keep_best(self) -> None:
+        current = score(self.evaluation)
+        if self.terrain:
+            current += self.terrain.score()
+        if current < self.best_score:
+            self.best_score = current
+            self.best_networks = self.alg.networks()
             self._save_as(checkpoint.BEST)
-        return scalars
 
     # --- log ------------------------------------------------------------------------------------
 
@@ -246,10 +286,12 @@ class KirasRunner(OnPolicyRunner):
         policy = self.alg.policy()
         content = {
             "config": config_to_dict(self.config),
+            "phase": self.phase,
             "skills": list(self.env.skills),
             "iteration": self.current_learning_iteration,
             "seconds": self.seconds,
             "best_score": self.best_score,
+            "best_networks": self.best_networks,
             "learner": self.alg.save(),
             "env": self.env.state_dict(),
             "generators": _generator_states(),
@@ -286,18 +328,45 @@ class KirasRunner(OnPolicyRunner):
         Raises:
             CheckpointError: Unusable file, or one of other skills.
         """
+        content = self._read(path)
+        if content["phase"] != self.phase:
+            raise checkpoint.CheckpointError(
+                f"{path} is of the phase {content['phase']}, not of {self.phase}"
+            )
+        self.alg.load(content["learner"], load_cfg, strict)
+        self.env.load_state_dict(content["env"])
+        self.current_learning_iteration = content["iteration"]
+        self.seconds, self.best_score = content["seconds"], content["best_score"]
+        self.best_networks = content["best_networks"]
+        _set_generator_states(content["generators"])
+        return content["infos"]
+
+    def begin_from(self, path: Path) -> None:
+        """Begin this phase with the best networks of the one before.
+
+        Best by deterministic evaluation; those at the end where none was evaluated.
+
+        Args:
+            path: Checkpoint at the end of the phase before.
+
+        Raises:
+            CheckpointError: Unusable file, or one of other skills.
+        """
+        content = self._read(path)
+        learner = content["learner"]
+        self.alg.begin_from(content["best_networks"], learner)
+        self.seconds = content["seconds"]
+        if self.alg.sampler:
+            self.env.set_skill_probabilities(self.alg.sampler.probabilities)
+
+    def _read(self, path: str | Path) -> dict:
         content = checkpoint.load_checkpoint(Path(path))
         if content["skills"] != list(self.env.skills):
             raise checkpoint.CheckpointError(
                 f"{path} was trained on the skills {', '.join(content['skills'])}; the robot has "
                 f"{', '.join(self.env.skills)}: mend its keyframes.yaml or start a new run"
             )
-        self.alg.load(content["learner"], load_cfg, strict)
-        self.env.load_state_dict(content["env"])
-        self.current_learning_iteration = content["iteration"]
-        self.seconds, self.best_score = content["seconds"], content["best_score"]
-        _set_generator_states(content["generators"])
-        return content["infos"]
+        return content
 
 
 class StopRequest:
@@ -340,12 +409,18 @@ class single_threaded:  # noqa: N801  (used like a function)
             torch.set_num_threads(self._threads)
 
 
-def _rsl_rl_config(config: Config) -> dict:
+def _rsl_rl_config(config: Config, phase: str, step_dt: float) -> dict:
+    alone = phase_config(config, phase)
+    residual_weight = None
+    if phase == FINETUNING and config.finetuning:
+        scale = step_dt if config.env.rewards.scale_by_dt else 1.0
+        residual_weight = config.finetuning.residual_weight * scale
     return {
         "algorithm": {"class_name": "kiras_rl.algorithms.kiras.KirasPPO"},
-        "learner": config.learner,
-        "iterations": config.iterations,
-        "num_steps_per_env": config.learner.ppo.num_steps,
+        "learner": alone.learner,
+        "iterations": alone.iterations,
+        "residual_weight": residual_weight,
+        "num_steps_per_env": alone.learner.ppo.num_steps,
         "save_interval": 0,
     }
 

@@ -12,7 +12,8 @@ import torch
 from kiras_rl.checkpoint import CheckpointError, load_checkpoint, save_checkpoint
 from kiras_rl.config import list_configs, load_config
 from kiras_rl.envs import make_env
-from kiras_rl.runner import KirasRunner, StopRequest
+from kiras_rl.phases import FINETUNING, SKILL_LEARNING, phase_config
+from kiras_rl.runner import Evaluators, KirasRunner, StopRequest
 
 # Noise, randomization and delay are on; episodes and premium windows end many times.
 TINY = (
@@ -28,14 +29,23 @@ TINY = (
     "learner.imitation.discriminator.batch_size=128",
 )
 
+ROUGH = (
+    "iterations=2",
+    "finetuning.iterations=3",
+    "finetuning.changes.env.terrain.levels=2",
+    "finetuning.changes.env.terrain.variants=2",
+)
+
 
 @pytest.fixture
 def make_runner(tmp_path):
     """Return a function that builds a run from its configuration: what a new process does."""
 
-    def make(run, *overrides, evaluate=None):
+    def make(run, *overrides, evaluate=None, phase=SKILL_LEARNING):
         config = load_config("solo8", [*TINY, *overrides])
-        return KirasRunner(make_env(config), config, tmp_path / run, "cpu", evaluate)
+        env = make_env(phase_config(config, phase))
+        evaluators = Evaluators(flat=evaluate)
+        return KirasRunner(env, config, tmp_path / run, "cpu", evaluators, phase=phase)
 
     return make
 
@@ -82,6 +92,44 @@ def test_a_resumed_training_ends_with_the_same_bits(make_runner):
         assert differences(one[part], other[part], part) == []
     assert one["learner"]["imitation"]["selector"]["scores"].isfinite().any()
     assert one["learner"]["estimation"]["adaboot"]["ready"]
+
+
+def test_a_training_resumed_anywhere_in_both_phases_ends_with_the_same_bits(make_runner):
+    def begin(run):
+        runner = make_runner(run, *ROUGH, phase=FINETUNING)
+        runner.begin_from(latest(runner))
+        return runner
+
+    whole = make_runner("whole", *ROUGH)
+    assert whole.learn()
+    whole = begin("whole")
+    assert whole.learn()
+
+    first = make_runner("parts", *ROUGH)
+    first.learn(1)
+    again = make_runner("parts", *ROUGH, "seed=77")
+    again.load(str(latest(first)))
+    assert again.learn()
+    second = begin("parts")
+    second.learn(1)
+    last = make_runner("parts", *ROUGH, "seed=77", phase=FINETUNING)
+    last.load(str(latest(second)))
+    assert last.current_learning_iteration == 3
+    assert last.learn()
+
+    one, other = load_checkpoint(latest(whole)), load_checkpoint(latest(last))
+    assert one["phase"] == other["phase"] == FINETUNING
+    assert one["iteration"] == other["iteration"] == 5
+    for part in ("learner", "env", "generators", "policy"):
+        assert differences(one[part], other[part], part) == []
+    assert len(one["env"]["tile"].unique()) > 2
+
+
+def test_a_checkpoint_of_another_phase_is_refused(make_runner):
+    runner = make_runner("run", *ROUGH)
+    runner.save_latest()
+    with pytest.raises(CheckpointError, match="is of the phase skill_learning, not of finetuning"):
+        make_runner("other", *ROUGH, phase=FINETUNING).load(str(latest(runner)))
 
 
 @pytest.mark.parametrize("cfg", [name for name in list_configs() if name.startswith("ablations/")])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
+from collections.abc import Callable
 
 import torch
 from rich.table import Table
@@ -15,9 +16,11 @@ from kiras_rl.envs import make_env
 from kiras_rl.envs.quadruped import QuadrupedEnv
 from kiras_rl.evaluation import SETTLE, Policy, SkillResult, evaluate_skills
 from kiras_rl.interfaces import HISTORY, PROPRIO
+from kiras_rl.phases import FINETUNING, phase_config
 from kiras_rl.robots.robot import load_robot
-from kiras_rl.runner import Evaluate
+from kiras_rl.runner import Evaluators
 from kiras_rl.schema import Config
+from kiras_rl.terrain_evaluation import TIME_LIMIT, TerrainResult, evaluate_terrain
 
 FLOOR = {"height": 0.03, "pitch": math.radians(5.0), "velocity": 0.12, "falls": 0.05}
 """What a skill must reach to be called learned: m, rad, m/s, share of robots."""
@@ -33,11 +36,22 @@ def make_evaluation_env(
     return make_env(config, device, num_envs)
 
 
-def make_evaluator(config: Config, device: str) -> Evaluate | None:
-    """Return the evaluation that runs beside a training; None where it is switched off."""
+def make_evaluators(config: Config, phase: str, device: str) -> Evaluators:
+    """Return the evaluations that run beside a phase of a training.
+
+    The one on flat ground is the same in both phases: it shows what finetuning forgets.
+
+    Raises:
+        ConfigError: A duration that leaves nothing to count, or a level that there is not.
+    """
+    if not config.evaluation.interval:
+        return Evaluators()
+    terrain = _make_terrain_evaluator(config, device) if phase == FINETUNING else None
+    return Evaluators(flat=_make_flat_evaluator(config, device), terrain=terrain)
+
+
+def _make_flat_evaluator(config: Config, device: str) -> Callable[[Policy], dict[str, SkillResult]]:
     settings = config.evaluation
-    if not settings.interval:
-        return None
     if settings.duration <= SETTLE:
         raise ConfigError(
             f"evaluation.duration={settings.duration}: more than the first {SETTLE} s, "
@@ -50,6 +64,40 @@ def make_evaluator(config: Config, device: str) -> Evaluate | None:
         return evaluate_skills(env, policy, settings.duration, settings.command)
 
     return evaluate
+
+
+def _make_terrain_evaluator(config: Config, device: str) -> Callable[[Policy], TerrainResult]:
+    settings = config.evaluation.terrain
+    rough = phase_config(config, FINETUNING)
+    levels = rough.env.terrain.levels
+    if not 0 <= settings.level < levels:
+        raise ConfigError(
+            f"evaluation.terrain.level={settings.level}: allowed are 0 to {levels - 1}, see levels "
+            "of the terrain in finetuning.changes"
+        )
+    types = [name for name in rough.env.terrain.types if name != "flat"]
+    num_envs = settings.robots * len(types) * len(load_robot(config.robot).skills)
+    env = make_evaluation_env(rough, num_envs, TIME_LIMIT, device)
+
+    def evaluate(policy: Policy) -> TerrainResult:
+        return evaluate_terrain(env, policy, settings.robots, settings.level, settings.command)
+
+    return evaluate
+
+
+def terrain_table(result: TerrainResult) -> Table:
+    """Return a table of the shares of success: terrain types by skills."""
+    title = f"terrain, level {result.level}: success %, in brackets without knees"
+    table = Table(title=title, title_justify="left")
+    table.add_column("terrain")
+    for skill in result.skills:
+        table.add_column(skill, justify="right")
+    for name, success, strict in zip(
+        result.terrains, result.success.tolist(), result.strict.tolist(), strict=True
+    ):
+        cells = [f"{100 * a:.0f} ({100 * b:.0f})" for a, b in zip(success, strict, strict=True)]
+        table.add_row(name, *cells)
+    return table
 
 
 def onboard_policy(policy: OnboardPolicy) -> Policy:

@@ -7,6 +7,7 @@ import datetime
 import logging
 import subprocess
 import sys
+from contextlib import suppress
 from pathlib import Path
 
 import torch
@@ -24,12 +25,25 @@ from kiras_rl.config import (
 )
 from kiras_rl.deploy.policy import OnboardPolicy, PolicyError, PolicyMetadata
 from kiras_rl.envs import make_env, resolve_backend
+from kiras_rl.envs.terrain_library import build_library
 from kiras_rl.export import ExportError, export_policy
+from kiras_rl.phases import (
+    FINETUNING,
+    SKILL_LEARNING,
+    phase_config,
+    phases_of,
+    total_iterations,
+)
 from kiras_rl.robots.robot import RobotError
 from kiras_rl.runner import KirasRunner, TrainingError
 from kiras_rl.schema import Config
 from kiras_rl.tools.curves import draw_curves
-from kiras_rl.tools.evaluator import make_evaluator, onboard_policy, results_table
+from kiras_rl.tools.evaluator import (
+    make_evaluators,
+    onboard_policy,
+    results_table,
+    terrain_table,
+)
 from kiras_rl.tools.progress import Progress
 
 DESCRIPTION = """\
@@ -88,16 +102,19 @@ def _parse(argv: list[str] | None) -> argparse.Namespace:
 
 def train(cfg: str | None, resume: Path | None, overrides: list[str], runs: Path) -> int:
     """Train a new run or go on with an old one; return the exit code."""
+    phase, source = SKILL_LEARNING, None
     if resume is not None:
         check_resume_overrides(overrides)
         source = checkpoint.find_checkpoint(resume, prefer=checkpoint.LATEST)
         run_dir = _run_of(source)
-        config = config_from_dict(checkpoint.load_checkpoint(source)["config"], overrides)
+        saved = checkpoint.load_checkpoint(source)
+        config, phase = config_from_dict(saved["config"], overrides), saved["phase"]
     else:
         assert cfg is not None
-        config, source = load_config(cfg, overrides), None
+        config = load_config(cfg, overrides)
         run_dir = _new_run_dir(runs, cfg)
-    runner = _build(config, run_dir)
+    _check(config)
+    runner = _build(config, run_dir, phase)
     if source is not None:
         runner.load(str(source))
     else:
@@ -106,12 +123,38 @@ def train(cfg: str | None, resume: Path | None, overrides: list[str], runs: Path
     _announce(config, runner, run_dir, source)
     with Progress(console) as progress:
         finished = runner.learn(on_iteration=progress.show)
+        if finished and phase == SKILL_LEARNING and config.finetuning:
+            runner = _next_phase(runner)
+            finished = runner.learn(on_iteration=progress.show)
     if not finished:
         message = f"stopped and saved; go on with: kiras-train --resume {run_dir}"
         console.print(message, highlight=False, soft_wrap=True)
         return 0
     _conclude(runner, run_dir)
     return 0
+
+
+def _check(config: Config) -> None:
+    """Refuse now what a later phase could not use, not after hours of training."""
+    for phase in phases_of(config):
+        terrain = phase_config(config, phase).env.terrain
+        if terrain:
+            build_library(terrain)
+
+
+def _next_phase(before: KirasRunner) -> KirasRunner:
+    """Return the learner of terrain finetuning, which begins where skill learning ended.
+
+    The best policy of skill learning stays in the run under a name of its own.
+    """
+    config, run_dir = before.config, before.run_dir
+    assert run_dir is not None
+    folder = run_dir / checkpoint.FOLDER
+    runner = _build(config, run_dir, FINETUNING)
+    runner.begin_from(folder / checkpoint.LATEST)
+    with suppress(FileNotFoundError):
+        (folder / checkpoint.BEST).replace(folder / checkpoint.FLAT)
+    return runner
 
 
 def _new_run_dir(runs: Path, cfg: str) -> Path:
@@ -140,11 +183,11 @@ def _run_of(source: Path) -> Path:
     return source.absolute().parent.parent
 
 
-def _build(config: Config, run_dir: Path) -> KirasRunner:
+def _build(config: Config, run_dir: Path, phase: str) -> KirasRunner:
     device = resolve_device(config.device)
-    env = make_env(config, device)
-    evaluate = make_evaluator(config, device)
-    runner = KirasRunner(env, config, run_dir, device, evaluate, commit=_source_commit())
+    env = make_env(phase_config(config, phase), device)
+    evaluators = make_evaluators(config, phase, device)
+    runner = KirasRunner(env, config, run_dir, device, evaluators, _source_commit(), phase)
     # What could not be exported is refused now, not after hours of training.
     PolicyMetadata.from_dict(runner.describe_policy())
     return runner
@@ -177,15 +220,20 @@ def resolve_device(name: str) -> str:
 
 def _announce(config: Config, runner: KirasRunner, run_dir: Path, source: Path | None) -> None:
     backend = resolve_backend(config.sim.backend, torch.device(runner.device))
-    steps = config.num_envs * config.learner.ppo.num_steps * config.iterations
+    steps = config.num_envs * config.learner.ppo.num_steps * total_iterations(config)
     verb = f"resuming at iteration {runner.current_learning_iteration}" if source else "training"
     console.print(
         f"[bold]{config.robot}[/]: {verb}, {', '.join(runner.env.skills)} | "
         f"{config.num_envs} worlds, {backend} physics, {runner.device} | "
-        f"{config.iterations} iterations, {steps / 1e6:.1f} M steps | {run_dir}",
+        f"{' + '.join(map(str, _lengths(config)))} iterations, {steps / 1e6:.1f} M steps | "
+        f"{run_dir}",
         highlight=False,
         soft_wrap=True,
     )
+
+
+def _lengths(config: Config) -> list[int]:
+    return [phase_config(config, phase).iterations for phase in phases_of(config)]
 
 
 def _conclude(runner: KirasRunner, run_dir: Path) -> None:
@@ -193,9 +241,12 @@ def _conclude(runner: KirasRunner, run_dir: Path) -> None:
     best = checkpoint.find_checkpoint(run_dir)
     onnx = export_policy(*checkpoint.load_policy(best), run_dir / "policy.onnx").path
     curves = draw_curves(run_dir)
-    if runner.evaluate:
-        results = runner.evaluate(onboard_policy(OnboardPolicy(onnx)))
+    evaluators, policy = runner.evaluators, onboard_policy(OnboardPolicy(onnx))
+    if evaluators.flat:
+        results = evaluators.flat(policy)
         console.print(results_table(results, "best policy, without action noise, v_x = 0.3 m/s"))
+    if evaluators.terrain:
+        console.print(terrain_table(evaluators.terrain(policy)))
     console.print(
         f"{runner.seconds / 60:.1f} min of training\n"
         f"checkpoint  {best}\nONNX        {onnx}\ncurves      {curves}\n"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from itertools import chain
 
 import torch
@@ -13,6 +14,7 @@ from torch import nn
 from kiras_rl import interfaces as names
 from kiras_rl.algorithms import losses, returns
 from kiras_rl.algorithms.estimation import Estimation
+from kiras_rl.algorithms.residual import Reference
 from kiras_rl.algorithms.storage import GroupRolloutStorage, mini_batches
 from kiras_rl.imitation.self_imitation import SelfImitation
 from kiras_rl.interfaces import SkillEnv
@@ -45,6 +47,7 @@ class KirasPPO(PPO):
         imitation: SelfImitation | None,
         estimation: Estimation | None,
         sampler: SkillSampler | None,
+        reference: Reference | None,
         device: str,
     ) -> None:
         """Take the parts; see `construct_algorithm`."""
@@ -70,11 +73,12 @@ class KirasPPO(PPO):
         self.iterations = iterations
         self.iteration = 0
         self.imitation, self.estimation, self.sampler = imitation, estimation, sampler
+        self.reference = reference
         self._apply_schedules()
 
     @property
     def progress(self) -> float:
-        """How much of skill learning is done, t / T1."""
+        """How much of this phase is done, t / T1 or t / T2."""
         return self.iteration / self.iterations
 
     # --- rollout --------------------------------------------------------------------------------
@@ -123,7 +127,10 @@ class KirasPPO(PPO):
         self, before: TensorDict, rewards: torch.Tensor, dones: torch.Tensor, extras: dict
     ) -> torch.Tensor:
         """Return task and imitation rewards, (N, G); summed where there is one critic."""
-        task = rewards.clamp(min=0.0) if self.config.ppo.only_positive_rewards else rewards
+        task = rewards
+        if self.reference:
+            task = task + self.reference.reward(before, self.transition.distribution_params[0])
+        task = task.clamp(min=0.0) if self.config.ppo.only_positive_rewards else task
         if self.imitation is None:
             return task.unsqueeze(1)
         imitation = self.imitation.record(before, rewards, dones, extras)
@@ -160,6 +167,8 @@ class KirasPPO(PPO):
             scalars |= self.estimation.update(self.storage, self.num_mini_batches)
         if self.imitation:
             scalars |= self.imitation.update(self.storage, self.iteration, self.progress)
+        if self.reference:
+            scalars["Residual/distance"] = self.reference.mean_distance()
         self.storage.clear()
         self.iteration += 1
         self._apply_schedules()
@@ -267,7 +276,9 @@ class KirasPPO(PPO):
         Args:
             obs: A first observation; gains the groups that the learner itself writes.
             env: The environment.
-            cfg: rsl-rl's dictionary; `learner` holds the LearnerConfig, `iterations` is T1.
+            cfg: rsl-rl's dictionary; `learner` holds the LearnerConfig, `iterations` is the length
+                of the phase, `residual_weight` that of the residual reward a step, None in a phase
+                without a reference.
             device: Where networks and storage live.
         """
         config: LearnerConfig = cfg["learner"]
@@ -288,8 +299,13 @@ class KirasPPO(PPO):
         sampler = (
             SkillSampler(config.skill_init, len(env.skills), device) if config.skill_init else None
         )
+        actor = _build_actor(obs, groups, env.num_actions, config).to(device)
+        residual_weight, reference = cfg["residual_weight"], None
+        if residual_weight is not None:
+            policy = ExportedPolicy(estimation.estimator if estimation else None, actor.mlp)
+            reference = Reference(policy, residual_weight)
         return KirasPPO(
-            actor=_build_actor(obs, groups, env.num_actions, config).to(device),
+            actor=actor,
             critic=GroupCritic(obs, groups, 2 if has_two else 1, list(ppo.critic_dims)).to(device),
             storage=storage,
             config=config,
@@ -297,8 +313,34 @@ class KirasPPO(PPO):
             imitation=imitation,
             estimation=estimation,
             sampler=sampler,
+            reference=reference,
             device=device,
         )
+
+    def networks(self) -> dict:
+        """Return copies of all weights that go on into the next phase."""
+        parts = {"actor": self.actor, "critic": self.critic.critics[TASK]}
+        if self.estimation:
+            parts["estimator"] = self.estimation.estimator
+        return {name: copy.deepcopy(part.state_dict()) for name, part in parts.items()}
+
+    def begin_from(self, networks: dict, learner: dict) -> None:
+        """Begin a phase where the one before ended.
+
+        Args:
+            networks: What `networks` returned there; frozen, they are also the reference.
+            learner: What `save` returned there: step size and skill probabilities go on.
+        """
+        self.actor.load_state_dict(networks["actor"])
+        self.critic.critics[TASK].load_state_dict(networks["critic"])
+        if self.estimation:
+            self.estimation.estimator.load_state_dict(networks["estimator"])
+        if self.reference:
+            self.reference.policy.load_state_dict(self.policy().state_dict())
+        self.learning_rate = learner["learning_rate"]
+        if self.sampler and "skill_probabilities" in learner:
+            self.sampler.probabilities = learner["skill_probabilities"].to(self.device)
+        self._apply_schedules()
 
     def train_mode(self) -> None:
         """Do nothing: no network here behaves differently in training."""
@@ -329,8 +371,12 @@ class KirasPPO(PPO):
         self._apply_schedules()
         return True
 
-    def _parts(self) -> dict[str, SelfImitation | Estimation]:
-        parts = {"imitation": self.imitation, "estimation": self.estimation}
+    def _parts(self) -> dict[str, SelfImitation | Estimation | Reference]:
+        parts = {
+            "imitation": self.imitation,
+            "estimation": self.estimation,
+            "reference": self.reference,
+        }
         return {name: part for name, part in parts.items() if part is not None}
 
 
