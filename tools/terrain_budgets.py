@@ -74,9 +74,7 @@ def _measure(
     return most
 
 
-def _fallen_from_the_sky(
-    ground: Ground, robot: Robot, generator: torch.Generator
-) -> torch.Tensor:
+def _fallen_from_the_sky(ground: Ground, robot: Robot, generator: torch.Generator) -> torch.Tensor:
     """Return positions above random places, in random orientations, (N, nq)."""
     qpos = torch.tensor(robot.keyframes[0].qpos).float().repeat(_WORLDS, 1)
     qpos[:, :2] = _SPREAD * (2 * torch.rand(_WORLDS, 2, generator=generator) - 1)
