@@ -41,20 +41,19 @@ class Ground:
         """Return the height of the ground at horizontal positions.
 
         Args:
-            points: Positions in the world, (N, P, 2), m.
+            points: Positions in the world, (N, P, 2), m. What is not a number is off the tile.
 
         Returns:
             Heights, (N, P), m.
         """
-        x, y = points[..., 0].contiguous(), points[..., 1].contiguous()
+        x, y = points.nan_to_num(nan=2 * HALF).movedim(-1, 0).contiguous().unbind()
         way = torch.maximum(x.abs(), y.abs())
         height = torch.maximum(self._ring_tops(x, y, way), self._ground(x, y))
         return torch.where(way <= HALF, height, 0.0).clamp(min=0.0)
 
     def _ring_tops(self, x: torch.Tensor, y: torch.Tensor, way: torch.Tensor) -> torch.Tensor:
         edges = self._edges[self.tile]
-        # A position that is not a number lies after the last ring.
-        ring = torch.searchsorted(edges, way).clamp(max=edges.shape[1] - 1)
+        ring = torch.searchsorted(edges, way)  # the last edge is infinite
         inner = edges.gather(1, (ring - 1).clamp(min=0)) * (ring > 0)
         across = torch.where(y > 0, 2, 3)
         side = torch.where(x > inner, 0, torch.where(x < -inner, 1, across))
@@ -63,8 +62,8 @@ class Ground:
     def _ground(self, x: torch.Tensor, y: torch.Tensor) -> torch.Tensor:
         """Interpolate on the triangles of MuJoCo: the cut goes from south-west to north-east."""
         last = self._points - 1
-        u = ((x + HALF) / self._cell).nan_to_num().clamp(0.0, last)
-        v = ((y + HALF) / self._cell).nan_to_num().clamp(0.0, last)
+        u = ((x + HALF) / self._cell).clamp(0.0, last)
+        v = ((y + HALF) / self._cell).clamp(0.0, last)
         column, row = u.floor().clamp(max=last - 1), v.floor().clamp(max=last - 1)
         u, v = u - column, v - row
         corner = self._grid[self.tile, None] * self._points**2

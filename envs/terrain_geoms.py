@@ -35,6 +35,12 @@ class TerrainGeoms:
     geoms: slice
     fields: dict[str, np.ndarray]
 
+    def show(self, model: mujoco.MjModel, data: mujoco.MjData, tile: int) -> None:
+        """Show a tile in a model of its own, as a viewer has."""
+        for name, values in self.fields.items():
+            getattr(model, name)[self.geoms] = values[tile]
+        mujoco.mj_setConst(model, data)  # renews the bounding volumes
+
 
 def add_terrain(spec: mujoco.MjSpec, library: TerrainLibrary) -> None:
     """Add a library's assets and geoms to a scene; they show no tile yet."""

@@ -63,7 +63,7 @@ def make_env(name: str, *overrides: str):
 def test_there_is_one_diff_an_example(extended):
     import kiras_rl
 
-    assert len(DIFFS) == len(re.findall(r"^## ", PAGE, re.MULTILINE)) == 5
+    assert len(DIFFS) == len(re.findall(r"^## ", PAGE, re.MULTILINE)) == 6
     assert Path(kiras_rl.__file__).is_relative_to(extended)
 
 
@@ -134,6 +134,19 @@ def test_a_robot_is_a_folder():
     torch.testing.assert_close(
         env.measure().base_height, torch.full((4,), 0.18), atol=0.01, rtol=0.0
     )
+
+
+def test_a_terrain_is_a_function_and_a_line():
+    from kiras_rl.config import load_config
+    from kiras_rl.envs.ground import Ground
+    from kiras_rl.envs.terrain_library import build_library
+
+    library = build_library(load_config("solo8_waves", ["env.terrain.noise=[0,0]"]).env.terrain)
+    ground = Ground(library, 1, torch.device("cpu"))
+    ground.tile[:] = library.index(library.types.index("waves"), 9, 0)
+    x = torch.tensor([0.6, 1.0, 1.4])  # trough, crest and trough of a wave 0.8 m long
+    heights = ground.heights(torch.stack([x, torch.zeros(3)], dim=1)[None])[0]
+    torch.testing.assert_close(heights, torch.tensor([0.0, 0.15, 0.0]), atol=6e-3, rtol=0.0)
 
 
 def test_an_ablation_is_a_file():

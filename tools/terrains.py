@@ -17,7 +17,7 @@ from rich.console import Console
 from rich.table import Table
 
 from kiras_rl.config import ConfigError, load_config
-from kiras_rl.envs.model import Scene, build_scene
+from kiras_rl.envs.model import build_scene
 from kiras_rl.envs.terrain_library import TerrainLibrary, build_library
 from kiras_rl.phases import FINETUNING, phase_config
 from kiras_rl.robots.robot import Robot, RobotError, load_robot
@@ -44,7 +44,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--out", type=Path, help="picture (default: runs/terrains/ROBOT.png)")
     parser.add_argument("--budgets", action="store_true", help="measure contacts on MuJoCo-Warp")
     parser.add_argument("overrides", nargs="*", metavar="key=value", help="of the configuration")
-    arguments = parser.parse_args(argv)
+    arguments = parser.parse_intermixed_args(argv)  # options between overrides, too
     try:
         whole = load_config(arguments.cfg, [f"robot={arguments.robot}", *arguments.overrides])
         config = phase_config(whole, FINETUNING)
@@ -154,19 +154,13 @@ def _render(robot: Robot, library: TerrainLibrary, tiles: set[int]) -> dict[int,
     data = mujoco.MjData(model)
     with make_renderer(model, *TILE) as renderer:
         for tile in tiles:
-            _show(scene, data, tile)
+            scene.terrain.show(model, data, tile)
             data.qpos[:] = robot.keyframes[0].qpos
             data.qpos[2] += library.spawn_height[tile]
             mujoco.mj_forward(model, data)
             renderer.update_scene(data, _camera(library.spawn_height[tile]))
             pictures[tile] = renderer.render().copy()
     return pictures
-
-
-def _show(scene: Scene, data: mujoco.MjData, tile: int) -> None:
-    for name, values in scene.terrain.fields.items():
-        getattr(scene.model, name)[scene.terrain.geoms] = values[tile]
-    mujoco.mj_setConst(scene.model, data)
 
 
 def _camera(lookat_height: float) -> mujoco.MjvCamera:

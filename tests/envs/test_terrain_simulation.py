@@ -176,7 +176,7 @@ def place_on_obstacles(sim, ground, drill):
 
 
 def test_balls_come_to_rest_on_the_ground(library):
-    """Every tile in a world of its own; a ball of radius r touches where ground + sphere is highest.
+    """Every tile in worlds of its own; a ball touches where ground and sphere together are highest.
 
     Balls fall through honey, hence straight and without bouncing.
     """

@@ -167,9 +167,7 @@ class Rays:
         self.terrain = terrain_geoms(self.model, library)
 
     def show(self, tile):
-        for name, values in self.terrain.fields.items():
-            getattr(self.model, name)[self.terrain.geoms] = values[tile]
-        mujoco.mj_setConst(self.model, self.data)
+        self.terrain.show(self.model, self.data, tile)
         mujoco.mj_forward(self.model, self.data)
 
     def heights(self, points):
