@@ -24,20 +24,22 @@ def phase_config(config: Config, phase: str) -> Config:
     and no self-imitation: neither a discriminator nor the critic of its reward.
 
     Raises:
-        ConfigError: A key in finetuning.changes that does not exist or has the wrong type.
+        ConfigError: A change of finetuning to a key that does not exist, or of the wrong type.
     """
     values = config_to_dict(config)
     if phase == SKILL_LEARNING or config.finetuning is None:
         return config_from_layers([values, {"finetuning": None}], "the saved configuration")
+    finetuning = config.finetuning
+    changes = {name: getattr(finetuning, name) for name in ("sim", "env", "learner")}
     alone = {
-        "iterations": config.finetuning.iterations,
+        "iterations": finetuning.iterations,
         "learner": {"imitation": None, "multi_critic": None},
         "finetuning": None,
     }
     try:
-        return config_from_layers([values, config.finetuning.changes, alone], "finetuning.changes")
+        return config_from_layers([values, changes, alone], "finetuning")
     except ConfigError as error:
-        where = "" if "finetuning.changes" in str(error) else "in finetuning.changes: "
+        where = "" if str(error).startswith("finetuning") else "finetuning: "
         raise ConfigError(f"{where}{error}") from None
 
 

@@ -247,11 +247,13 @@ class EvaluationConfig:
 
 @dataclass
 class FinetuningConfig:
-    """Terrain finetuning, the second phase."""
+    """Terrain finetuning, the second phase; sim, env and learner hold what changes there."""
 
     iterations: int
     residual_weight: float
-    changes: dict[str, Any]
+    sim: dict[str, Any]
+    env: dict[str, Any]
+    learner: dict[str, Any]
 
 
 @dataclass

@@ -140,8 +140,10 @@ def test_a_terrain_is_a_function_and_a_line():
     from kiras_rl.config import load_config
     from kiras_rl.envs.ground import Ground
     from kiras_rl.envs.terrain_library import build_library
+    from kiras_rl.phases import FINETUNING, phase_config
 
-    library = build_library(load_config("solo8_waves", ["env.terrain.noise=[0,0]"]).env.terrain)
+    config = load_config("solo8_waves", ["finetuning.env.terrain.noise=[0,0]"])
+    library = build_library(phase_config(config, FINETUNING).env.terrain)
     ground = Ground(library, 1, torch.device("cpu"))
     ground.tile[:] = library.index(library.types.index("waves"), 9, 0)
     x = torch.tensor([0.6, 1.0, 1.4])  # trough, crest and trough of a wave 0.8 m long

@@ -32,8 +32,8 @@ TINY = (
 ROUGH = (
     "iterations=2",
     "finetuning.iterations=3",
-    "finetuning.changes.env.terrain.levels=2",
-    "finetuning.changes.env.terrain.variants=2",
+    "finetuning.env.terrain.levels=2",
+    "finetuning.env.terrain.variants=2",
 )
 
 

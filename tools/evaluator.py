@@ -73,7 +73,7 @@ def _make_terrain_evaluator(config: Config, device: str) -> Callable[[Policy], T
     if not 0 <= settings.level < levels:
         raise ConfigError(
             f"evaluation.terrain.level={settings.level}: allowed are 0 to {levels - 1}, see levels "
-            "of the terrain in finetuning.changes"
+            "of finetuning.env.terrain"
         )
     types = [name for name in rough.env.terrain.types if name != "flat"]
     num_envs = settings.robots * len(types) * len(load_robot(config.robot).skills)

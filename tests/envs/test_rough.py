@@ -21,8 +21,8 @@ CALM = (
     "env.skills.velocity_noise=0",
     "env.randomization.push_velocity=null",
     "env.randomization.action_delay=null",
-    "finetuning.changes.env.terrain.levels=2",
-    "finetuning.changes.env.terrain.variants=2",
+    "finetuning.env.terrain.levels=2",
+    "finetuning.env.terrain.variants=2",
 )
 
 

@@ -273,6 +273,6 @@ def refusal(config):
 
 @pytest.mark.parametrize("key", ["levels", "variants", "scale", "cell"])
 def test_sizes_are_positive(key):
-    config = load_config("base", [f"finetuning.changes.env.terrain.{key}=0"])
+    config = load_config("base", [f"finetuning.env.terrain.{key}=0"])
     with pytest.raises(ConfigError, match=f"env.terrain.{key}=0.*: must be positive"):
         phase_config(config, FINETUNING)

@@ -6,7 +6,7 @@ from matplotlib.image import imread
 
 from kiras_rl.tools import rendering, terrains
 
-SMALL = ["env.terrain.levels=2", "env.terrain.variants=2"]
+SMALL = ["finetuning.env.terrain.levels=2", "finetuning.env.terrain.variants=2"]
 
 
 @pytest.fixture(autouse=True)
@@ -49,9 +49,12 @@ def test_without_opengl_one_line_names_the_package(monkeypatch, capsys):
     ("arguments", "message"),
     [
         (["solo9"], "there is no robot 'solo9'"),
-        (["solo8", "env.terrain=null"], "env.terrain=null: this configuration has no terrain"),
-        (["solo8", "env.terrain.cell=0.3"], "a tile of 8 m has to be a whole number of cells"),
-        (["solo8", "env.terrain.levls=3"], "did you mean 'env.terrain.levels'?"),
+        (["solo8", "--cfg", "solo8_quick"], "this configuration has no terrain"),
+        (
+            ["solo8", "finetuning.env.terrain.cell=0.3"],
+            "a tile of 8 m has to be a whole number of cells",
+        ),
+        (["solo8", "finetuning.env.terrain.levls=3"], "did you mean 'env.terrain.levels'?"),
     ],
 )
 def test_what_cannot_be_is_one_line(arguments, message, capsys):
