@@ -38,7 +38,8 @@ class Cockpit:
         skill: Index of the skill that is asked for.
         speed: Times real time.
         push_speed: Velocity that a push adds, m/s.
-        falls: How often the robot had to be put back.
+        pushes: How often it was pushed.
+        falls: How often it had to be put back.
         notice: The last thing worth telling, or an empty text.
     """
 
@@ -57,7 +58,7 @@ class Cockpit:
         self._generator = np.random.default_rng(seed)
         self.paused, self._single_step = False, False
         self.speed, self.push_speed = SPEEDS[0], 0.5
-        self.falls, self.notice = 0, ""
+        self.pushes, self.falls, self.notice = 0, 0, ""
         self.skill = 0
         self._install(Driver(policy), title)
 
@@ -124,6 +125,7 @@ class Cockpit:
 
     def push(self) -> None:
         """Add `push_speed` to the base, in a random horizontal direction."""
+        self.pushes += 1
         angle = self._generator.uniform(0, 2 * np.pi)
         self.driver.push(self.push_speed * np.array([np.cos(angle), np.sin(angle), 0.0]))
 

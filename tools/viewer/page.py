@@ -60,6 +60,7 @@ class Page:
         self._thread.start()
         if not self._ready.wait(_START_SECONDS) or self._failure:
             raise PageError(f"the page could not be served at {self.url}: {self._failure}")
+        _wait_until_open(_reachable(host).strip("[]"), port)
 
     def show(self, stage: Stage) -> None:
         """Send the stage as it stands; a new one makes browsers load its model."""
@@ -135,6 +136,8 @@ class _Viewer(web_viewer.WebViewer):
 
 def _free_port(host: str, port: int) -> int:
     """Check that a port can be had, and choose one if it is 0."""
+    if not 0 <= port <= 65535:
+        raise PageError(f"--port is a number from 0 to 65535, not {port}")
     try:
         family, *_, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
         with socket.socket(family, socket.SOCK_STREAM) as probe:
@@ -149,6 +152,19 @@ def _free_port(host: str, port: int) -> int:
             f"port {port} is taken, perhaps by another kiras-play: name another one with "
             "--port, or 0 for any free one"
         ) from None
+
+
+def _wait_until_open(host: str, port: int) -> None:
+    """Wait for the server's thread to listen: whoever is told the address may come at once."""
+    end = time.monotonic() + _START_SECONDS
+    while True:
+        try:
+            socket.create_connection((host, port), timeout=1.0).close()
+            return
+        except OSError:
+            if time.monotonic() > end:
+                raise PageError(f"nothing answers at port {port} of {host}") from None
+            time.sleep(0.02)
 
 
 def _reachable(host: str) -> str:

@@ -14,7 +14,8 @@ GHOST_GROUP = 1
 _PREFIX = "ghost_"
 _COLOUR = (0.20, 0.62, 0.95, 0.30)
 _COLLISION_GROUP = 3
-_SUN = 1.6
+_SUN = 1.6  # times the light of the scene
+_SKY = 64  # pixels
 
 
 class Stage:
@@ -33,7 +34,7 @@ class Stage:
         self.driver = driver
         spec = driver.spec.copy()
         spec.worldbody.add_frame().attach_body(_ghost(driver), _PREFIX, "")
-        _light(spec)
+        _dress(spec)
         self.model = spec.compile()
         self.data = mujoco.MjData(self.model)
         self._own = driver.model.nq
@@ -75,12 +76,17 @@ def ghost_pose(qpos: np.ndarray, posture: Posture, side: float = 0.0) -> np.ndar
     return np.concatenate([place, quat, posture.joint_pos])
 
 
-def _light(spec: mujoco.MjSpec) -> None:
-    """Give more of the light to the sun: the page's renderer brings soft light of its own."""
+def _dress(spec: mujoco.MjSpec) -> None:
+    """Suit the scene to the page: more sun, for its renderer brings soft light of its own.
+
+    The sky's gradient needs few pixels; a browser waits for every one of them.
+    """
     spec.visual.headlight.ambient[:] = 0.08
     spec.visual.headlight.diffuse[:] = 0.06
     for light in spec.lights:
         light.diffuse = [_SUN * part for part in light.diffuse]
+    sky = spec.texture("sky")
+    sky.width, sky.height = _SKY, 6 * _SKY
 
 
 def _ghost(driver: Driver) -> mujoco.MjsBody:
@@ -91,6 +97,6 @@ def _ghost(driver: Driver) -> mujoco.MjsBody:
             spec.delete(geom)
             continue
         geom.material, geom.rgba, geom.group = "", _COLOUR, GHOST_GROUP
-    for actuator in list(spec.actuators):
-        spec.delete(actuator)
+    for element in [*spec.actuators, *spec.materials, *spec.textures]:
+        spec.delete(element)
     return spec.body(driver.robot.base_body)
