@@ -14,7 +14,7 @@ GHOST_GROUP = 1
 _PREFIX = "ghost_"
 _COLOUR = (0.20, 0.62, 0.95, 0.30)
 _COLLISION_GROUP = 3
-_SUN = 1.6  # times the light of the scene
+_SUN, _GROUND = 3.0, 0.62  # times the light and the colours of the scene
 _SKY = 64  # pixels
 
 
@@ -77,15 +77,20 @@ def ghost_pose(qpos: np.ndarray, posture: Posture, side: float = 0.0) -> np.ndar
 
 
 def _dress(spec: mujoco.MjSpec) -> None:
-    """Suit the scene to the page: more sun, for its renderer brings soft light of its own.
+    """Suit the scene to the page, whose renderer brings soft light of its own.
 
-    The sky's gradient needs few pixels; a browser waits for every one of them.
+    A strong sun on a darker ground gives the robot its shadow. The sky's gradient needs few pixels,
+    and a browser waits for every one of them.
     """
     spec.visual.headlight.ambient[:] = 0.08
     spec.visual.headlight.diffuse[:] = 0.06
-    for light in spec.lights:
-        light.diffuse = [_SUN * part for part in light.diffuse]
-    sky = spec.texture("sky")
+    sun, *others = spec.lights
+    sun.diffuse = _SUN * sun.diffuse
+    for light in others:
+        light.castshadow = False
+    ground, sky = spec.texture("floor"), spec.texture("sky")
+    for colour in ("rgb1", "rgb2", "markrgb"):
+        setattr(ground, colour, _GROUND * getattr(ground, colour))
     sky.width, sky.height = _SKY, 6 * _SKY
 
 
