@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import os
 import shutil
+import threading
 import time
 
 import pytest
 
+from kiras_rl.checkpoint import save_checkpoint
 from kiras_rl.deploy.policy import OnboardPolicy, PolicyError
 from kiras_rl.tools.viewer.choices import list_choices, newest_checkpoint, title_of
 from kiras_rl.tools.viewer.cockpit import Cockpit
@@ -133,6 +135,35 @@ def test_choosing_a_policy_changes_what_drives(still_file, exported, tmp_path):
     session.run(seconds=2.0)
     assert selector.current() == cockpit.title == "solo8/now"
     assert cockpit.notice.startswith("loaded at ")
+
+
+def test_a_followed_run_gives_its_newest_policy_to_the_running_robot(
+    run, still_file, make_metadata, make_policy
+):
+    """The checkpoint is a real one; a policy without an estimator tells itself from the first."""
+    metadata, networks = make_metadata(), make_policy(make_metadata(), gain=0.0, estimator=False)
+    cockpit = Cockpit(OnboardPolicy(still_file))
+    session = Session(cockpit, lambda: None, View(), follow=run, runs=run)
+    save_checkpoint(
+        run / "checkpoints" / "latest.pt",
+        {
+            "learner": {},
+            "policy_shape": networks.shape(),
+            "policy": networks.state_dict(),
+            "description": metadata.to_dict(),
+        },
+    )
+    end = time.monotonic() + 60
+    loop = threading.Thread(target=session.run)
+    loop.start()
+    while not cockpit.notice and time.monotonic() < end:
+        time.sleep(0.1)
+    session.close()
+    loop.join()
+    assert cockpit.notice.startswith("loaded at ")
+    assert cockpit.title == "solo8/2026-01-02_10-00-00"
+    assert not cockpit.driver.policy.velocity.any()
+    assert cockpit.driver.time > 1.0  # it went on meanwhile, and after
 
 
 def test_a_session_keeps_real_time_and_slows_down(still_file):
