@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 
@@ -10,6 +10,7 @@ import mujoco
 import numpy as np
 from numpy.typing import ArrayLike
 
+from kiras_rl.deploy.metadata import Posture
 from kiras_rl.deploy.policy import OnboardPolicy, PolicyError, PolicyMetadata, projected_gravity
 from kiras_rl.robots.robot import Robot, RobotError, load_robot
 
@@ -104,8 +105,10 @@ class Driver:
     Attributes:
         policy: The policy that drives.
         robot: The robot that the policy names.
+        spec: The scene as a document: what a viewer adds its own things to, on a copy.
         model: The simulated scene.
         data: Its state.
+        substeps: Physics steps in a control step.
     """
 
     def __init__(self, policy: OnboardPolicy) -> None:
@@ -118,9 +121,10 @@ class Driver:
         meta = self.metadata
         self.robot = load_robot(meta.robot)
         _check_joints(self.robot, meta)
-        self.model = _build_model(self.robot, meta)
+        self.spec = self.robot.spec()
+        self.model = _build_model(self.spec, meta)
         self.data = mujoco.MjData(self.model)
-        self._substeps = round(1 / (meta.control_rate * self.model.opt.timestep))
+        self.substeps = round(1 / (meta.control_rate * self.model.opt.timestep))
         self._feet = np.array([self.model.geom(name).id for name in self.robot.foot_geoms])
         self._base = np.array([self.model.geom(name).id for name in self.robot.base_geoms])
         self._gravity = np.array([_gravity_at(meta.keyframes[s].pitch) for s in meta.skills])
@@ -148,11 +152,20 @@ class Driver:
         Raises:
             PolicyError: If the skill is unknown or the command has another length.
         """
+        index = self.policy.skill_index(skill)
+        self.set_command(command)
+        self._previous, self._skill = self._skill, index
+
+    def set_command(self, command: ArrayLike) -> None:
+        """Change the command alone, (3,): a change of skill that is under way stays one.
+
+        Raises:
+            PolicyError: If the command has another length.
+        """
         command = np.asarray(command, np.float64)
         if command.shape != (3,):
             raise PolicyError(f"a command is v_x, v_y and yaw rate, not {command.tolist()}")
-        index = self.policy.skill_index(skill)
-        self._previous, self._skill, self._command = self._skill, index, command
+        self._command = command
 
     def reset(self, skill: str | int) -> None:
         """Put the robot at rest into the posture of a skill, with its feet just above the ground.
@@ -172,12 +185,34 @@ class Driver:
         self.policy.reset(posture.joint_pos)
         self._previous = index
 
+    def take_over(self, other: Driver) -> None:
+        """Go on from another driver's state: a new policy for the same robot in full stride.
+
+        Raises:
+            RobotError: If the other robot has other joints.
+        """
+        _check_joints(other.robot, self.metadata)
+        self.data.qpos[:], self.data.qvel[:] = other.data.qpos, other.data.qvel
+        self.data.ctrl[:] = other.data.ctrl
+        mujoco.mj_forward(self.model, self.data)
+        self.policy.reset(other.data.ctrl)
+        self._steps = other._steps
+
     def push(self, velocity: ArrayLike) -> None:
         """Add a velocity to the base, (3,), world frame, m/s."""
         self.data.qvel[:3] += np.asarray(velocity, np.float64)
 
-    def step(self) -> Sample:
-        """Run one control period and return how it ended."""
+    @property
+    def posture(self) -> Posture:
+        """The posture that is asked for."""
+        return self.metadata.keyframes[self.metadata.skills[self._skill]]
+
+    def step(self, after_substep: Callable[[], None] | None = None) -> Sample:
+        """Run one control period and return how it ended.
+
+        Args:
+            after_substep: Called after every physics step, for who watches in slow motion.
+        """
         data = self.data
         data.ctrl[:] = self.policy.step(
             joint_pos=data.qpos[7:],
@@ -188,9 +223,11 @@ class Driver:
             skill=self._skill,
         )
         torque = np.zeros(self.model.nu)
-        for _ in range(self._substeps):
+        for _ in range(self.substeps):
             mujoco.mj_step(self.model, data)
-            torque += data.actuator_force / self._substeps
+            torque += data.actuator_force / self.substeps
+            if after_substep is not None:
+                after_substep()
         self._steps += 1
         return self._sample(torque)
 
@@ -324,8 +361,8 @@ def _check_joints(robot: Robot, metadata: PolicyMetadata) -> None:
         )
 
 
-def _build_model(robot: Robot, metadata: PolicyMetadata) -> mujoco.MjModel:
-    model = robot.spec().compile()
+def _build_model(spec: mujoco.MjSpec, metadata: PolicyMetadata) -> mujoco.MjModel:
+    model = spec.compile()
     limit = np.array(metadata.torque_limit)
     model.actuator_gainprm[:, 0] = metadata.kp
     model.actuator_biasprm[:, 1] = -np.array(metadata.kp)

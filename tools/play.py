@@ -1,4 +1,4 @@
-"""kiras-play: drive one simulated robot with a policy, and show how it went."""
+"""kiras-play: drive one simulated robot with a policy, live or by a script."""
 
 from __future__ import annotations
 
@@ -22,10 +22,14 @@ from kiras_rl.tools.driver import (
     record,
 )
 from kiras_rl.tools.rendering import RenderError
+from kiras_rl.tools.viewer import DEFAULT_PORT, LOOPBACK, LiveError
+from kiras_rl.tools.viewer.choices import title_of
+from kiras_rl.tools.viewer.cockpit import Cockpit
 
 _DESCRIPTION = """\
 Drive one simulated robot on flat ground with a trained policy, through the same code that runs on
-a real robot, and show how it went: a table of every skill's errors, or pictures.
+a real robot: live in a browser page (what happens without options) or with the keys of a terminal,
+or by a script, which ends in a table of every skill's errors or in pictures.
 
 The policy is one of
   RUN          a run folder: its policy.onnx, else checkpoints/best.pt, else checkpoints/latest.pt
@@ -33,26 +37,35 @@ The policy is one of
   ONNX         a policy file written by kiras-train or kiras-export
   (nothing)    the policy that comes with the robot
 
-Without --script the robot stands for one second and then shows every skill for four. A robot that
-falls is put back into the posture of its skill. Exit status: 0, or 2 if something was wrong with
-what was given.
+Live, the page and --terminal show their keys. With --table, --trace, --frames or --video, or with
+--script or --command alone, a script is driven: without --script the robot stands for one second
+and then shows every skill for four. A robot that falls is put back into the posture of its skill.
+Exit status: 0, also after Ctrl-C, or 2 if something was wrong with what was given.
 """
 
 _EXAMPLES = """\
 examples:
-  kiras-play                                        the shipped policy: a table
+  kiras-play                                        the shipped policy, in a browser page
   kiras-play runs/solo8/2026-01-01_12-00-00         the policy of a run
+  kiras-play --host 0.0.0.0 --port 9000             let other machines see the page, and drive
+  kiras-play --terminal                             drive with keys where there is no browser
+  kiras-play runs/solo8/2026-01-01_12-00-00 --follow    watch a training: newest checkpoint
+  kiras-play --table                                every skill's errors
   kiras-play --trace trace.png                      posture, speed, contacts, torques over time
   kiras-play --frames strip.png --video walk.mp4    pictures and a film
   kiras-play --command 0.5,0,0.3                    every skill, turning left at 0.3 rad/s
   kiras-play --script walk:4:0.3,crawl:4:0.3        skill:seconds:v_x[:v_y[:yaw_rate]], ...
 """
 
+_COMMAND = "0.3"  # m/s, of a script that is not given
+_SCREENSHOT_SPEED = 0.3  # m/s
+
 _PICTURES = (".png", ".jpg", ".pdf", ".svg")
 _OUTPUTS = {
     "--trace": ((*_PICTURES, ".npz"), "everything over time, drawn or as arrays"),
     "--frames": (_PICTURES, "a strip of pictures for every skill"),
     "--video": ((".mp4",), "a film; needs kiras-rl[video]"),
+    "--screenshot": ((".png", ".jpg"), "the page, drawn by a headless Chromium"),
 }
 
 
@@ -60,8 +73,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; return its exit status."""
     options = _parser().parse_args(arguments)
     try:
-        _play(options)
-    except (PolicyError, RobotError, RenderError, OSError) as error:
+        if _is_live(options):
+            _drive(options)
+        else:
+            _play(options)
+    except KeyboardInterrupt:
+        return 0
+    except (PolicyError, RobotError, RenderError, LiveError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
     return 0
@@ -83,13 +101,23 @@ def _parser() -> argparse.ArgumentParser:
     )
     tasks.add_argument(
         "--command",
-        default="0.3",
         metavar="V_X[,V_Y[,YAW]]",
         help="command for every skill, m/s and rad/s (0.3)",
     )
+    add("--table", action="store_true", help="print every skill's errors")
     for name, (endings, text) in _OUTPUTS.items():
         add(name, type=_file(endings), metavar="FILE", help=f"{text} ({' '.join(endings)})")
+    _add_live_options(parser.add_argument_group("live"))
     return parser
+
+
+def _add_live_options(group: argparse._ArgumentGroup) -> None:
+    add = group.add_argument
+    add("--terminal", action="store_true", help="drive with keys, without a browser")
+    add("--follow", action="store_true", help="load a run's newest checkpoint as it appears")
+    add("--host", default=LOOPBACK, help=f"address that the page listens on ({LOOPBACK})")
+    add("--port", type=int, default=DEFAULT_PORT, help=f"its port, 0: any ({DEFAULT_PORT})")
+    add("--no-browser", action="store_true", help="only print the page's address")
 
 
 def _file(endings: tuple[str, ...]) -> Callable[[str], Path]:
@@ -101,10 +129,39 @@ def _file(endings: tuple[str, ...]) -> Callable[[str], Path]:
     return check
 
 
+def _is_live(options: argparse.Namespace) -> bool:
+    scripted = options.script or options.command or options.table
+    return not (scripted or options.trace or options.frames or options.video)
+
+
+def _drive(options: argparse.Namespace) -> None:
+    """Let a person drive, or take a picture of what they would see."""
+    from kiras_rl.tools.viewer import live  # mujoco.studio: what a script does not need
+
+    source = options.policy
+    if options.follow:
+        if source is None:
+            raise PolicyError("--follow needs a run: kiras-play runs/solo8/<time> --follow")
+        policy = policy_files.load_policy(live.wait_for_checkpoint(source), options.robot)
+    else:
+        policy = policy_files.load_policy(source, options.robot)
+    shipped = source or policy_files.shipped_policy(policy.metadata.robot)
+    cockpit = Cockpit(policy, title_of(shipped))
+    follow = source if options.follow else None
+    if options.screenshot:
+        live.save_screenshot(cockpit, options.screenshot, speed=_SCREENSHOT_SPEED)
+        print(f"wrote {options.screenshot}")
+    elif options.terminal:
+        live.drive_terminal(cockpit, follow)
+    else:
+        live.drive_page(cockpit, options.host, options.port, not options.no_browser, follow)
+
+
 def _play(options: argparse.Namespace) -> None:
+    """Drive a script, and show how it went."""
     driver = Driver(policy_files.load_policy(options.policy, options.robot))
     trace = record(driver, _script(options, driver))
-    if not (options.trace or options.frames or options.video):
+    if options.table or not (options.trace or options.frames or options.video):
         rows = summary.summarize(trace, driver.metadata)
         Console().print(summary.table(rows, f"{driver.metadata.robot}, {trace.time[-1]:.3g} s"))
     if options.trace:
@@ -116,7 +173,7 @@ def _play(options: argparse.Namespace) -> None:
 def _script(options: argparse.Namespace, driver: Driver) -> list[Segment]:
     if options.script is not None:
         return parse_script(options.script, driver.metadata)
-    return default_script(driver.metadata, parse_command(options.command))
+    return default_script(driver.metadata, parse_command(options.command or _COMMAND))
 
 
 def _save_trace(trace: Trace, driver: Driver, path: Path) -> None:

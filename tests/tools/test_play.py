@@ -1,8 +1,13 @@
-"""kiras-play: a table, a picture, and one line for everything that cannot be."""
+"""kiras-play: the page, a table, a picture, and one line for everything that cannot be."""
 
 from __future__ import annotations
 
+import re
+import signal
+import socket
+import subprocess
 import sys
+import urllib.request
 
 import matplotlib.image
 import numpy as np
@@ -15,8 +20,25 @@ from kiras_rl.tools.play import main
 SHORT = "--script=walk:0.4:0.3,crawl:0.4:0.3"
 
 
-def test_without_pictures_it_prints_a_table_of_every_skill(still_file, capsys):
-    assert main([str(still_file)]) == 0
+def test_the_page_is_served_until_ctrl_c(still_file):
+    command = [sys.executable, "-m", "kiras_rl.tools.play", still_file, "--port=0", "--no-browser"]
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    with subprocess.Popen(command, **pipes) as process:
+        try:
+            line = process.stdout.readline()
+            assert "driving still.onnx: http://127.0.0.1:" in line
+            assert "this machine only" in line
+            url = re.search(r"http://\S+/", line)[0]
+            assert b"<canvas" in urllib.request.urlopen(url, timeout=10).read()
+            process.send_signal(signal.SIGINT)
+            out, err = process.communicate(timeout=20)
+        finally:
+            process.kill()
+    assert (process.returncode, out.strip(), err) == (0, "", "")
+
+
+def test_a_table_of_every_skill_is_printed(still_file, capsys):
+    assert main([str(still_file), "--table"]) == 0
     out = capsys.readouterr().out
     assert "solo8, 21 s" in out
     for skill in load_robot("solo8").skills:
@@ -52,7 +74,7 @@ def test_a_strip_of_pictures_is_drawn(still_file, tmp_path):
 
 def test_the_policy_that_comes_with_a_robot_is_taken(monkeypatch, still_file, tmp_path, capsys):
     monkeypatch.setattr(policy_files, "shipped_policy", lambda robot: still_file)
-    assert main([SHORT]) == 0
+    assert main([SHORT]) == 0  # a script that nothing is to be made of ends in the table
     assert "solo8, 0.8 s" in capsys.readouterr().out
 
 
@@ -69,7 +91,8 @@ def test_help_reads_like_a_manual(capsys):
         main(["--help"])
     assert leaving.value.code == 0
     out = capsys.readouterr().out
-    for word in ("examples:", "--trace", "--script", "kiras-play --frames", "RUN", "CHECKPOINT"):
+    words = ("examples:", "--follow", "--terminal", "--trace", "--script", "RUN", "CHECKPOINT")
+    for word in (*words, "kiras-play --frames"):
         assert word in out
 
 
@@ -94,6 +117,9 @@ def error_of(capsys):
         (["--script", "walk"], "a script's part is skill:seconds:v_x"),
         (["--command", "fast"], "a command is v_x[,v_y[,yaw_rate]], e.g. 0.3"),
         (["--robot", "go1"], "--robot go1 was given, but"),
+        (["--follow"], "only a run can be followed, such as runs/solo8/<time>, not "),
+        (["--host", "999.1.1.1"], "cannot listen on --host 999.1.1.1"),
+        (["--port", "99999"], "--port is a number from 0 to 65535, not 99999"),
     ],
 )
 def test_a_bad_request_is_one_line(error_of, still_file, arguments, message):
@@ -102,6 +128,26 @@ def test_a_bad_request_is_one_line(error_of, still_file, arguments, message):
 
 def test_a_missing_file_is_one_line(error_of, tmp_path):
     assert "there is no file or folder" in error_of(tmp_path / "gone.onnx")
+
+
+def test_following_nothing_is_one_line(error_of):
+    assert "--follow needs a run" in error_of("--follow")
+
+
+def test_a_port_that_is_taken_is_one_line(error_of, still_file):
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = server.getsockname()[1]
+        assert f"port {port} is taken" in error_of(still_file, "--port", port)
+
+
+def test_driving_with_keys_needs_a_terminal(error_of, still_file):
+    assert "--terminal needs a terminal" in error_of(still_file, "--terminal")
+
+
+def test_a_picture_of_the_page_needs_a_browser(monkeypatch, error_of, still_file, tmp_path):
+    monkeypatch.setenv("PATH", "")
+    message = error_of(still_file, "--screenshot", tmp_path / "page.jpg")
+    assert "none of chromium, chromium-browser, google-chrome" in message
 
 
 def test_a_foreign_file_is_one_line(error_of, tmp_path):

@@ -1,0 +1,71 @@
+"""The ghost: where it stands, and that the robot does not feel it."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+import pytest
+
+from kiras_rl.deploy.policy import OnboardPolicy
+from kiras_rl.tools.driver import Driver
+from kiras_rl.tools.viewer.stage import GHOST_GROUP, Stage, ghost_pose
+
+
+def trajectory(policy_file, watched):
+    driver = Driver(OnboardPolicy(policy_file))
+    stage = Stage(driver) if watched else None
+    driver.set_task("pitch_down", (0.3, 0.0, 0.2))
+    rows = []
+    for _ in range(50):
+        rows.append(driver.step().qpos)
+        if stage:
+            stage.pose()
+            mujoco.mj_forward(stage.model, stage.data)
+    return np.array(rows)
+
+
+def test_the_physics_is_the_same_with_and_without_a_ghost(exported):
+    policy_file = exported[2]
+    np.testing.assert_array_equal(trajectory(policy_file, True), trajectory(policy_file, False))
+
+
+def test_the_ghost_is_seen_and_never_touched(still_file):
+    model = Stage(Driver(OnboardPolicy(still_file))).model
+    ghost = model.geom_group == GHOST_GROUP
+    assert ghost.sum() > 20
+    assert not model.geom_contype[ghost].any()
+    assert not model.geom_conaffinity[ghost].any()
+    assert (model.geom_rgba[ghost, 3] < 0.5).all()
+
+
+def test_the_ghost_stands_at_the_robots_place_in_the_posture_asked_for(still_file):
+    driver = Driver(OnboardPolicy(still_file))
+    driver.set_task("pitch_down", (0, 0, 0))
+    driver.data.qpos[:7] = (2.0, 3.0, 0.21, np.cos(0.4), 0, 0, np.sin(0.4))  # heading 0.8 rad
+    stage = Stage(driver)
+    stage.pose()
+    mujoco.mj_kinematics(stage.model, stage.data)
+    posture = driver.metadata.keyframes["pitch_down"]
+    ghost = stage.data.body("ghost_base")
+    np.testing.assert_allclose(ghost.xpos, (2.0, 3.0, posture.base_height))
+    axes = ghost.xmat.reshape(3, 3)
+    assert np.arctan2(axes[1, 0], axes[0, 0]) == pytest.approx(0.8)
+    assert np.arcsin(-axes[2, 0]) == pytest.approx(posture.pitch)
+    np.testing.assert_array_equal(stage.data.qpos[22:], posture.joint_pos)
+    np.testing.assert_array_equal(stage.data.qpos[:15], driver.data.qpos)
+
+
+def test_beside_is_to_the_left_of_the_heading(still_file):
+    """Heading along the world's y: left is its -x."""
+    posture = OnboardPolicy(still_file).metadata.keyframes["walk"]
+    qpos = np.array([1.0, 2.0, 0.2, np.sqrt(0.5), 0, 0, np.sqrt(0.5), *posture.joint_pos])
+    np.testing.assert_allclose(ghost_pose(qpos, posture, side=0.5)[:2], (0.5, 2.0), atol=1e-12)
+
+
+def test_a_new_policy_for_the_same_robot_keeps_the_scene(still_file):
+    stage = Stage(Driver(OnboardPolicy(still_file)))
+    other = Driver(OnboardPolicy(still_file))
+    assert stage.move_to(other) is stage
+    other.data.qpos[0] = 5.0
+    stage.pose()
+    assert stage.data.qpos[0] == 5.0

@@ -1,0 +1,42 @@
+"""What the page shows beside the drive itself; plain data that page and session share."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+GHOSTS = {"off": 0.0, "inside": 0.0, "beside": 0.45}
+"""Where the ghost stands: m to the left of the robot."""
+
+
+@dataclass(frozen=True)
+class Selector:
+    """A list to choose from: policies today; whatever else the driver can be built with."""
+
+    label: str
+    options: Callable[[], Sequence[str]]
+    current: Callable[[], str]
+    choose: Callable[[int], None]
+    """Is called, from the page's thread, with the index of what was chosen."""
+
+
+@dataclass
+class View:
+    """What is looked at, what can be chosen, and how well the clock is kept."""
+
+    ghost: str = "inside"
+    follow: bool = True
+    real_time: float = 1.0
+    """Simulated seconds in a second, over the last ones, at full speed."""
+    gamepad: str = ""
+    selectors: list[Selector] = field(default_factory=list)
+
+    @property
+    def side(self) -> float:
+        """How far to the left of the robot the ghost stands, m."""
+        return GHOSTS[self.ghost]
+
+    def next_ghost(self) -> None:
+        """Go on to the next place of the ghost."""
+        names = list(GHOSTS)
+        self.ghost = names[(names.index(self.ghost) + 1) % len(names)]
