@@ -45,10 +45,18 @@ def load_config(name: str, overrides: list[str] | tuple[str, ...] = ()) -> Confi
 def config_from_dict(values: dict, overrides: list[str] | tuple[str, ...] = ()) -> Config:
     """Rebuild a configuration from `config_to_dict`, with overrides.
 
+    Keys that are younger than what was saved get the values of base.
+
     Raises:
         ConfigError: As `load_config`.
     """
-    return _resolve([values], list(overrides), source="the saved configuration")
+    source = "the saved configuration"
+    saved = _merge(OmegaConf.structured(Config), values, source)
+    base = OmegaConf.create(_read_chain("base")[0])
+    younger = OmegaConf.create()
+    for key in OmegaConf.missing_keys(saved):
+        OmegaConf.update(younger, key, OmegaConf.select(base, key))
+    return _resolve([values, younger], list(overrides), source)
 
 
 def config_from_layers(layers: list[dict], source: str) -> Config:

@@ -231,7 +231,7 @@ class TerrainEvaluationConfig:
 
     robots: int
     level: int
-    command: float
+    command: tuple[float, float]
 
 
 @dataclass

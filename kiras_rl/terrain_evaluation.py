@@ -117,7 +117,7 @@ def rough_types(env: SkillEnv) -> list[int]:
 
 
 def evaluate_terrain(
-    env: SkillEnv, policy: Policy, robots: int, level: int, speed: float
+    env: SkillEnv, policy: Policy, robots: int, level: int, speeds: tuple[float, float]
 ) -> TerrainResult:
     """Try every skill on every rough terrain type.
 
@@ -126,16 +126,19 @@ def evaluate_terrain(
         policy: Observation -> mean actions.
         robots: Trials of each type and skill.
         level: Difficulty level.
-        speed: Commanded v_x, m/s.
+        speeds: Lowest and highest commanded v_x, spread evenly over the trials of a cell, m/s.
     """
     types, count = rough_types(env), len(env.skills)
     terrain = torch.tensor(types, device=env.device).repeat_interleave(count * robots)
     skill = torch.arange(count, device=env.device).repeat_interleave(robots).repeat(len(types))
+    # The middle of as many equal parts of the range as there are trials.
+    parts = (torch.arange(robots, device=env.device) + 0.5) / robots
+    spread = speeds[0] + (speeds[1] - speeds[0]) * parts
     trials = Trials(
         terrain=terrain,
         level=torch.full_like(terrain, level),
         skill=skill,
-        speed=torch.full((env.num_envs,), speed, device=env.device),
+        speed=spread.repeat(len(types) * count),
     )
     outcomes = run_trials(env, policy, trials)
 

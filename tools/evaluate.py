@@ -17,13 +17,16 @@ from kiras_rl.checkpoint import CheckpointError
 from kiras_rl.config import ConfigError, config_from_dict, load_config
 from kiras_rl.deploy.metadata import PolicyError
 from kiras_rl.evaluation import Policy, SkillResult, evaluate_skills
-from kiras_rl.robots.robot import RobotError
+from kiras_rl.phases import FINETUNING, SKILL_LEARNING, phase_config
+from kiras_rl.robots.robot import RobotError, load_robot
 from kiras_rl.schema import Config
+from kiras_rl.terrain_evaluation import TIME_LIMIT, evaluate_terrain
 from kiras_rl.tools.evaluator import (
     FLOOR,
     make_evaluation_env,
     onboard_policy,
     results_table,
+    terrain_table,
 )
 from kiras_rl.tools.policy_files import load_policy
 from kiras_rl.transitions import Transitions, evaluate_transitions
@@ -37,6 +40,10 @@ flat         every skill walks straight ahead for 20 s; height and pitch errors 
 transitions  every ordered pair of skills, switched while walking: falls, and time until the moving
              averages of height (1.5 cm) and pitch (3 degrees) stay at the new keyframe for 0.3 s;
              a robot that was not in the first skill before the switch counts as not settled
+terrain      every skill crosses every rough terrain type at several levels of difficulty, 0 the
+             lowest and 10 the top: from the middle of a tile, with any heading, which is held, at
+             0.2 to 0.6 m/s, 3 m far within twice the time of the way and 20 s, without a fall;
+             strictly, if thighs and shanks touch the ground in at most 5 % of the steps
 """
 
 EXAMPLES = """\
@@ -44,7 +51,16 @@ examples:
   kiras-evaluate                              the policy shipped with Solo-8
   kiras-evaluate runs/solo8_quick/2026-01-31_12-00-00
   kiras-evaluate policy.onnx --protocol transitions --trials 50 --json transitions.json
+  kiras-evaluate policy.onnx --protocol terrain --levels 4,5 --trials 100
 """
+
+PROTOCOLS = ("all", "flat", "transitions", "terrain")
+
+LEVELS = 11
+"""Of the terrain protocol, whatever the training had: steps of a tenth from lowest to top."""
+
+SPEEDS = (0.2, 0.6)
+"""Commanded v_x of the terrain protocol, m/s."""
 
 console = Console()
 
@@ -71,10 +87,15 @@ def _parse(argv: list[str] | None) -> argparse.Namespace:
     )
     parser.add_argument("policy", nargs="?", type=Path, help="run folder, checkpoint or ONNX file")
     parser.add_argument("--robot", help="whose shipped policy, if none is given (solo8)")
-    parser.add_argument("--protocol", choices=("all", "flat", "transitions"), default="all")
+    parser.add_argument("--protocol", choices=PROTOCOLS, default="all")
     parser.add_argument("--robots", type=int, default=100, help="robots a skill (flat)")
     parser.add_argument("--duration", type=float, default=20.0, help="s a robot (flat)")
-    parser.add_argument("--trials", type=int, default=50, help="trials a pair (transitions)")
+    parser.add_argument(
+        "--trials", type=int, default=50, help="of a pair (transitions), or of a cell (terrain)"
+    )
+    parser.add_argument(
+        "--levels", type=_levels, default="0,2,4,6,8,10", help="of terrain, 0 to 10"
+    )
     parser.add_argument("--command", type=float, default=0.3, help="v_x, m/s")
     parser.add_argument("--nominal", action="store_true", help="no randomization, noise or pushes")
     parser.add_argument("--json", type=Path, help="also write the figures to this file")
@@ -90,7 +111,8 @@ def evaluate(args: argparse.Namespace) -> dict:
             "this policy does not say how it was trained (provenance.config is missing): export it "
             "from its run or checkpoint with kiras-export"
         )
-    config = _physics(config_from_dict(metadata.provenance["config"]), args.nominal)
+    whole = config_from_dict(metadata.provenance["config"])
+    config = _physics(phase_config(whole, SKILL_LEARNING), args.nominal)
     skills = len(metadata.skills)
     report: dict = {"provenance": metadata.provenance, "command": args.command}
     if args.protocol in ("all", "flat"):
@@ -101,6 +123,37 @@ def evaluate(args: argparse.Namespace) -> dict:
         _verdict(results)
     if args.protocol in ("all", "transitions"):
         report["transitions"] = _transitions(config, policy, skills, args)
+    if args.protocol == "terrain" or (args.protocol == "all" and whole.finetuning):
+        rough = _physics(phase_config(whole, FINETUNING), args.nominal)
+        report["terrain"] = _terrain(rough, policy, args)
+    return report
+
+
+def _levels(text: str) -> list[int]:
+    levels = [int(part) for part in text.split(",") if part.isdigit()]
+    if len(levels) != text.count(",") + 1 or max(levels) >= LEVELS:
+        raise argparse.ArgumentTypeError(f"'{text}': give levels from 0 to {LEVELS - 1}, as in 4,5")
+    return levels
+
+
+def _terrain(config: Config, policy: Policy, args: argparse.Namespace) -> dict:
+    """Try every skill on every rough type at every level, one level after the other."""
+    if config.env.terrain is None:
+        raise ConfigError("this policy's configuration has no terrain: finetuning=null in its run")
+    config.env.terrain.levels = LEVELS
+    skills = load_robot(config.robot).skills
+    types = [name for name in config.env.terrain.types if name != "flat"]
+    env = make_evaluation_env(config, args.trials * len(types) * len(skills), TIME_LIMIT)
+    report = {}
+    for level in args.levels:
+        result = evaluate_terrain(env, policy, args.trials, level, SPEEDS)
+        console.print(terrain_table(result))
+        report[str(level)] = {
+            "terrains": result.terrains,
+            "skills": result.skills,
+            "success": result.success.tolist(),
+            "strict": result.strict.tolist(),
+        }
     return report
 
 

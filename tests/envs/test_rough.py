@@ -196,7 +196,7 @@ def test_who_gets_far_enough_in_time_succeeds(build):
 
 def test_shares_are_those_of_type_and_skill(build):
     env = build("num_envs=20", "env.terminations.episode_length=21")
-    result = evaluate_terrain(env, holding_policy(env), robots=1, level=0, speed=0.6)
+    result = evaluate_terrain(env, holding_policy(env), robots=1, level=0, speeds=(0.6, 0.6))
     assert result.terrains == ("slopes", "bars", "footholds", "stairs")
     assert result.success.shape == (4, 5)
     assert result.score() == pytest.approx(2.0)  # who holds its pose gets nowhere
