@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
-import torch
+from typing import TYPE_CHECKING
 
 from kiras_rl.config import ConfigError
-from kiras_rl.envs.quadruped import QuadrupedEnv
 from kiras_rl.robots.robot import load_robot
 from kiras_rl.schema import Config
+
+if TYPE_CHECKING:
+    import torch
+
+    from kiras_rl.envs.quadruped import QuadrupedEnv
 
 BACKENDS = ("auto", "native", "warp")
 
@@ -26,6 +30,11 @@ def make_env(
         ConfigError: Unknown backend, or the native backend on a GPU.
         RobotError: Unknown robot or a keyframe that cannot be.
     """
+    # imported here: terrains and scenes are made without torch, which takes seconds
+    import torch
+
+    from kiras_rl.envs.quadruped import QuadrupedEnv
+
     device = torch.device(device)
     return QuadrupedEnv(
         config.env,

@@ -7,13 +7,9 @@ import torch
 from kiras_rl.envs.randomness import UniformBuffer, scale_to
 from kiras_rl.envs.state import RobotState, Task
 from kiras_rl.envs.terrain_library import TerrainLibrary
-from kiras_rl.envs.terrains import HALF
 
 COLUMNS = {"terrain": 2}
 """Random numbers that this module takes each step."""
-
-CROSSED = HALF - 0.3
-"""A robot this far from the middle, the larger of |x| and |y|, has crossed its tile, m."""
 
 LOST_SHARE = 0.5  # of the commanded way; a robot that made less of it is stuck
 LEAST_WAY = 1.0  # m commanded before a robot can count as stuck

@@ -11,7 +11,7 @@ from tensordict import TensorDict
 from kiras_rl import interfaces as names
 from kiras_rl.envs import commands, curriculum, randomization, rotations, terminations
 from kiras_rl.envs.commands import TaskSampler
-from kiras_rl.envs.curriculum import CROSSED, Curriculum
+from kiras_rl.envs.curriculum import Curriculum
 from kiras_rl.envs.description import describe_deployment
 from kiras_rl.envs.ground import Ground
 from kiras_rl.envs.kinematics import FootKinematics
@@ -24,6 +24,7 @@ from kiras_rl.envs.rewards import RewardSum
 from kiras_rl.envs.simulation.base import Simulation
 from kiras_rl.envs.state import CONTACT_FORCE, Keyframes, RobotState, Step, Task
 from kiras_rl.envs.terrain_library import TerrainLibrary, build_library
+from kiras_rl.envs.terrains import CROSSED
 from kiras_rl.interfaces import Measurements, SkillEnv
 from kiras_rl.robots.robot import Robot
 from kiras_rl.schema import EnvConfig, SimConfig

@@ -66,6 +66,17 @@ def add_terrain(spec: mujoco.MjSpec, library: TerrainLibrary) -> None:
         )
 
 
+def add_tile(spec: mujoco.MjSpec, library: TerrainLibrary, tile: int) -> None:
+    """Add one tile to a scene for good, with no more geoms than it needs."""
+    one = library.only(tile)
+    add_terrain(spec, one)
+    for k, (pos, size) in enumerate(zip(one.box_pos[0], one.box_size[0], strict=True)):
+        geom = spec.geom(f"terrain/{k}")
+        geom.pos, geom.size = pos, size
+    if len(one.grids) > 1:
+        spec.geom("terrain/ground").pos = (0.0, 0.0, one.grids[1].min())
+
+
 def terrain_geoms(model: mujoco.MjModel, library: TerrainLibrary) -> TerrainGeoms:
     """Return the fields of every tile in a model to which `add_terrain` was applied."""
     boxes, has_ground = library.box_pos.shape[1], len(library.grids) > 1

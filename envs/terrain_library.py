@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 import zlib
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import TypeVar
 
@@ -72,6 +72,22 @@ class TerrainLibrary:
     def index(self, kind: Index, level: Index, variant: Index) -> Index:
         """Return the numbers of tiles from the numbers of their type, level and variant."""
         return (kind * self.levels + level) * self.variants + variant
+
+    def only(self, tile: int) -> TerrainLibrary:
+        """Return the tables of one tile, without padding."""
+        own = slice(tile, tile + 1)
+        boxes = int((self.box_pos[tile, :, 2] != PARKED[2]).sum())
+        grid = self.grid[own]
+        return replace(
+            self,
+            edges=self.edges[own],
+            tops=self.tops[own],
+            grid=np.minimum(grid, 1),
+            grids=self.grids[np.unique([0, *grid])],
+            box_pos=self.box_pos[own, :boxes],
+            box_size=self.box_size[own, :boxes],
+            spawn_height=self.spawn_height[own],
+        )
 
 
 def build_library(config: TerrainConfig) -> TerrainLibrary:

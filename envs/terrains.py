@@ -15,6 +15,9 @@ import numpy as np
 HALF = 4.0
 """Half the width of a tile, m."""
 
+CROSSED = HALF - 0.3
+"""A robot this far from the middle, the larger of |x| and |y|, has crossed its tile, m."""
+
 PLATFORM = 0.6
 """Half the width of the level ground in the centre, m; it does not scale with the robot."""
 

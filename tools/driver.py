@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields
-from pathlib import Path
+from collections.abc import Callable
+from dataclasses import dataclass
 
 import mujoco
 import numpy as np
@@ -12,23 +11,13 @@ from numpy.typing import ArrayLike
 
 from kiras_rl.deploy.metadata import Posture
 from kiras_rl.deploy.policy import OnboardPolicy, PolicyError, PolicyMetadata, projected_gravity
+from kiras_rl.envs.terrains import CROSSED
 from kiras_rl.robots.robot import Robot, RobotError, load_robot
+from kiras_rl.tools.ground import Terrain, Tile, ground_height, terrain_of
 
 _CONTACT_FORCE = 1.0  # N; less is a graze
 _FALL_COSINE = np.cos(np.deg2rad(60.0))  # gravity this far from the posture: not recoverable
 _CLEARANCE = 0.002  # m between the lowest foot and the ground at a reset
-
-
-@dataclass(frozen=True)
-class Segment:
-    """Part of a script: a skill and a command for some seconds.
-
-    `command` is v_x, v_y in m/s and yaw rate in rad/s.
-    """
-
-    duration: float
-    skill: str
-    command: tuple[float, float, float]
 
 
 @dataclass(frozen=True)
@@ -38,7 +27,7 @@ class Sample:
     time: float
     """Seconds since the driver was made."""
     base_height: float
-    """Base origin above the ground, m."""
+    """Base origin above the ground under it, m."""
     pitch: float
     """Positive = nose down, rad."""
     roll: float
@@ -59,45 +48,14 @@ class Sample:
     """v_x, v_y, yaw rate; (3,), m/s and rad/s."""
     fallen: bool
     """The base presses on the ground, or leans 60 degrees away from its posture."""
+    crossed: bool
+    """It has come to the end of its tile; never on flat ground, which has none."""
     qpos: np.ndarray
     """Full configuration, for drawing, (7 + J,)."""
 
 
-@dataclass(frozen=True)
-class Trace:
-    """Samples of a script, stacked over T steps, and what is needed to read them.
-
-    The arrays are the fields of `Sample` with a leading T.
-    """
-
-    robot: str
-    skills: tuple[str, ...]
-    feet: tuple[str, ...]
-    rate: float
-    """Samples a second."""
-    time: np.ndarray
-    base_height: np.ndarray
-    pitch: np.ndarray
-    roll: np.ndarray
-    lin_vel: np.ndarray
-    yaw_rate: np.ndarray
-    foot_contact: np.ndarray
-    joint_torque: np.ndarray
-    joint_pos: np.ndarray
-    skill: np.ndarray
-    command: np.ndarray
-    fallen: np.ndarray
-    qpos: np.ndarray
-    segment: np.ndarray
-    """Index of the script's segment, (T,)."""
-
-    def save(self, path: str | Path) -> None:
-        """Write all arrays and names to one .npz file."""
-        np.savez_compressed(path, **{item.name: getattr(self, item.name) for item in fields(self)})
-
-
 class Driver:
-    """A simulated robot on flat ground, commanded through its onboard policy.
+    """A simulated robot, commanded through its onboard policy; on flat ground until told otherwise.
 
     Gains and torque limits are those of the policy file: the robot is driven as it was in training,
     whatever its folder says today.
@@ -105,14 +63,19 @@ class Driver:
     Attributes:
         policy: The policy that drives.
         robot: The robot that the policy names.
+        tile: The ground that it is on.
         spec: The scene as a document: what a viewer adds its own things to, on a copy.
-        model: The simulated scene.
+        model: The simulated scene; another one after `show`.
         data: Its state.
         substeps: Physics steps in a control step.
     """
 
-    def __init__(self, policy: OnboardPolicy) -> None:
+    def __init__(self, policy: OnboardPolicy, terrain: Terrain | None = None) -> None:
         """Build the scene and stand in the first skill's posture, commanded to stand.
+
+        Args:
+            policy: The policy that drives.
+            terrain: The tiles that `show` chooses from; None for those of the policy.
 
         Raises:
             RobotError: If the robot of the policy is unknown or has other joints.
@@ -121,16 +84,52 @@ class Driver:
         meta = self.metadata
         self.robot = load_robot(meta.robot)
         _check_joints(self.robot, meta)
-        self.spec = self.robot.spec()
-        self.model = _build_model(self.spec, meta)
-        self.data = mujoco.MjData(self.model)
+        self._terrain = terrain
+        self._build(Tile())
         self.substeps = round(1 / (meta.control_rate * self.model.opt.timestep))
-        self._feet = np.array([self.model.geom(name).id for name in self.robot.foot_geoms])
-        self._base = np.array([self.model.geom(name).id for name in self.robot.base_geoms])
         self._gravity = np.array([_gravity_at(meta.keyframes[s].pitch) for s in meta.skills])
         self._steps = 0
         self._skill, self._command = 0, np.zeros(3)
         self.reset(0)
+
+    def _build(self, tile: Tile) -> None:
+        spec = self.robot.spec()
+        if not tile.is_flat:
+            self.terrain.build(spec, tile)
+        self.tile, self.spec = tile, spec
+        self.model = _build_model(spec, self.metadata)
+        self.data = mujoco.MjData(self.model)
+        self._feet = np.array([self.model.geom(name).id for name in self.robot.foot_geoms])
+        self._base = np.array([self.model.geom(name).id for name in self.robot.base_geoms])
+
+    @property
+    def terrain(self) -> Terrain:
+        """The tiles to choose from; read when they are first asked for."""
+        if self._terrain is None:
+            self._terrain = terrain_of(self.metadata)
+        return self._terrain
+
+    def show(self, kind: str, level: int = 0, variant: int = 0) -> None:
+        """Put a tile under the robot, and the robot on its platform in the posture asked for.
+
+        Args:
+            kind: Type of terrain; "flat" is the endless floor.
+            level: Difficulty, from 0.
+            variant: Which of the tiles of this type and level, from 0.
+
+        Raises:
+            ConfigError: If there is no such tile, or the configuration holds what cannot be.
+        """
+        tile = Tile(kind, level, variant)
+        self.terrain.check(tile)
+        self._build(tile)
+        self.reset(self._skill)
+
+    def ground_height(self, place: ArrayLike) -> float:
+        """Return the height of the ground under a base at a place, (2,), m."""
+        if self.tile.is_flat:
+            return 0.0
+        return ground_height(self.model, self.data, np.asarray(place))
 
     @property
     def metadata(self) -> PolicyMetadata:
@@ -170,6 +169,8 @@ class Driver:
     def reset(self, skill: str | int) -> None:
         """Put the robot at rest into the posture of a skill, with its feet just above the ground.
 
+        That is in the middle of the tile, on its platform.
+
         The task stays as it is.
         """
         index = self.policy.skill_index(skill)
@@ -179,7 +180,7 @@ class Driver:
         self.data.qpos[7:] = posture.joint_pos
         mujoco.mj_kinematics(self.model, self.data)
         lowest = self.data.geom_xpos[self._feet, 2].min() - self.robot.foot_radius
-        self.data.qpos[2] += _CLEARANCE - lowest
+        self.data.qpos[2] += _CLEARANCE - lowest + self.ground_height((0.0, 0.0))
         self.data.ctrl[:] = posture.joint_pos
         mujoco.mj_forward(self.model, self.data)
         self.policy.reset(posture.joint_pos)
@@ -187,6 +188,8 @@ class Driver:
 
     def take_over(self, other: Driver) -> None:
         """Go on from another driver's state: a new policy for the same robot in full stride.
+
+        Both have to be on the same ground.
 
         Raises:
             RobotError: If the other robot has other joints.
@@ -242,7 +245,7 @@ class Driver:
         pressing = self._ground_force() > _CONTACT_FORCE
         return Sample(
             time=self.time,
-            base_height=float(qpos[2]),
+            base_height=float(qpos[2]) - self.ground_height(qpos[:2]),
             pitch=float(np.arcsin(np.clip(-vertical[0], -1, 1))),
             roll=float(np.arctan2(vertical[1], vertical[2])),
             lin_vel=np.array(
@@ -255,6 +258,7 @@ class Driver:
             skill=self._skill,
             command=self._command.copy(),
             fallen=bool(pressing[self._base].any() or self._leans(qpos[3:7])),
+            crossed=bool(not self.tile.is_flat and np.abs(qpos[:2]).max() > CROSSED),
             qpos=qpos,
         )
 
@@ -270,87 +274,6 @@ class Driver:
         """Whether gravity is far from the posture asked for and from the one before it."""
         wanted = self._gravity[[self._skill, self._previous]]
         return bool((wanted @ projected_gravity(quat)).max() < _FALL_COSINE)
-
-
-def record(driver: Driver, script: Sequence[Segment]) -> Trace:
-    """Run a script and keep every sample; a fallen robot starts again in its skill's posture."""
-    samples, segments = [], []
-    driver.reset(script[0].skill)
-    for number, segment in enumerate(script):
-        driver.set_task(segment.skill, segment.command)
-        for _ in range(max(1, round(segment.duration * driver.metadata.control_rate))):
-            sample = driver.step()
-            samples.append(sample)
-            segments.append(number)
-            if sample.fallen:
-                driver.reset(segment.skill)
-    stacked = {
-        item.name: np.array([getattr(sample, item.name) for sample in samples])
-        for item in fields(Sample)
-    }
-    meta = driver.metadata
-    return Trace(
-        robot=meta.robot,
-        skills=meta.skills,
-        feet=driver.robot.foot_geoms,
-        rate=meta.control_rate,
-        segment=np.array(segments),
-        **stacked,
-    )
-
-
-def default_script(
-    metadata: PolicyMetadata, command: tuple[float, float, float] = (0.3, 0.0, 0.0)
-) -> list[Segment]:
-    """Stand for a second, then every skill of the policy for four, one after the other."""
-    stand = Segment(1.0, metadata.skills[0], (0.0, 0.0, 0.0))
-    return [stand, *(Segment(4.0, skill, command) for skill in metadata.skills)]
-
-
-def parse_script(text: str, metadata: PolicyMetadata) -> list[Segment]:
-    """Read a script such as `walk:4:0.3,crawl:4:0.3:0:0.2`.
-
-    Each part is skill:seconds:v_x, and may go on with :v_y and :yaw_rate.
-
-    Raises:
-        PolicyError: If a part cannot be read or names a skill that the policy does not have.
-    """
-    return [_parse_segment(part.strip(), metadata) for part in text.split(",")]
-
-
-def parse_command(text: str) -> tuple[float, float, float]:
-    """Read `v_x[,v_y[,yaw_rate]]`, m/s and rad/s; what is left out is zero.
-
-    Raises:
-        PolicyError: If these are not one to three finite numbers.
-    """
-    try:
-        numbers = [float(part) for part in text.split(",")]
-    except ValueError:
-        numbers = []
-    if not 1 <= len(numbers) <= 3 or not np.isfinite(numbers).all():
-        raise PolicyError(f"a command is v_x[,v_y[,yaw_rate]], e.g. 0.3 or 0.3,0,0.5, not '{text}'")
-    v_x, v_y, yaw_rate = [*numbers, 0.0, 0.0][:3]
-    return v_x, v_y, yaw_rate
-
-
-def _parse_segment(part: str, metadata: PolicyMetadata) -> Segment:
-    skill, _, rest = part.partition(":")
-    duration, _, command = rest.partition(":")
-    try:
-        seconds = float(duration)
-    except ValueError:
-        seconds = -1.0
-    if not 0 < seconds < np.inf or not command:
-        raise PolicyError(
-            f"a script's part is skill:seconds:v_x[:v_y[:yaw_rate]], e.g. "
-            f"{metadata.skills[0]}:4:0.3, not '{part}'"
-        )
-    if skill not in metadata.skills:
-        raise PolicyError(
-            f"unknown skill '{skill}' in the script; this policy has: {', '.join(metadata.skills)}"
-        )
-    return Segment(seconds, skill, parse_command(command.replace(":", ",")))
 
 
 def _check_joints(robot: Robot, metadata: PolicyMetadata) -> None:

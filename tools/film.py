@@ -14,7 +14,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from PIL import Image, ImageDraw, ImageFont
 
-from kiras_rl.tools.driver import Trace
+from kiras_rl.tools.script import Trace
 from kiras_rl.tools.rendering import RenderError, make_renderer
 
 FRAMES = 8  # pictures in a strip

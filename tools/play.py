@@ -12,8 +12,10 @@ from rich.console import Console
 from kiras_rl.deploy.policy import PolicyError
 from kiras_rl.robots.robot import RobotError
 from kiras_rl.tools import policy_files, summary
-from kiras_rl.tools.driver import (
-    Driver,
+from kiras_rl.tools.driver import Driver
+from kiras_rl.tools.ground import Tile, terrain_of
+from kiras_rl.tools.rendering import RenderError
+from kiras_rl.tools.script import (
     Segment,
     Trace,
     default_script,
@@ -21,7 +23,6 @@ from kiras_rl.tools.driver import (
     parse_script,
     record,
 )
-from kiras_rl.tools.rendering import RenderError
 from kiras_rl.tools.viewer import DEFAULT_PORT, LOOPBACK, LiveError
 from kiras_rl.tools.viewer.choices import title_of
 from kiras_rl.tools.viewer.cockpit import Cockpit
@@ -163,7 +164,7 @@ def _play(options: argparse.Namespace) -> None:
     trace = record(driver, _script(options, driver))
     if options.table or not (options.trace or options.frames or options.video):
         rows = summary.summarize(trace, driver.metadata)
-        Console().print(summary.table(rows, f"{driver.metadata.robot}, {trace.time[-1]:.3g} s"))
+        Console().print(summary.table(rows, trace.title))
     if options.trace:
         _save_trace(trace, driver, options.trace)
     if options.frames or options.video:

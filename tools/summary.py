@@ -9,7 +9,7 @@ from rich import box
 from rich.table import Table
 
 from kiras_rl.deploy.policy import PolicyMetadata
-from kiras_rl.tools.driver import Trace
+from kiras_rl.tools.script import Trace
 
 SETTLE = 1.0  # s after a change of task that do not count: the robot is on its way
 _COLUMNS = (
@@ -42,6 +42,8 @@ class SkillSummary:
     lifts: float
     """Lifts a second of the foot that lifts least."""
     falls: int
+    crossings: int | None
+    """Ends of the tile that it came to; None on flat ground."""
 
 
 def summarize(trace: Trace, metadata: PolicyMetadata) -> list[SkillSummary]:
@@ -55,6 +57,9 @@ def table(summaries: list[SkillSummary], title: str) -> Table:
     result.add_column("skill", no_wrap=True)
     for name in _COLUMNS:
         result.add_column(name, justify="right")
+    rough = any(item.crossings is not None for item in summaries)
+    if rough:
+        result.add_column("crossed", justify="right")
     for item in summaries:
         result.add_row(
             item.skill,
@@ -65,6 +70,7 @@ def table(summaries: list[SkillSummary], title: str) -> Table:
             f"{item.velocity_error:.2f}",
             f"{item.lifts:.1f}",
             str(item.falls),
+            *([str(item.crossings)] if rough else []),
             style="red" if item.falls else None,
         )
     return result
@@ -88,6 +94,7 @@ def _summarize(trace: Trace, metadata: PolicyMetadata, skill: int) -> SkillSumma
         velocity_error=float(np.abs(speed - command).mean()),
         lifts=float(lifts_per_second(trace.foot_contact, rows, trace.rate).min()),
         falls=int(trace.fallen[mine].sum()),
+        crossings=None if trace.terrain == "flat" else int(trace.crossed[mine].sum()),
     )
 
 

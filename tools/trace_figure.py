@@ -13,7 +13,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from kiras_rl.deploy.policy import PolicyMetadata
-from kiras_rl.tools.driver import Trace
+from kiras_rl.tools.script import Trace
 
 _STYLE = {"font.size": 9, "axes.spines.top": False, "axes.spines.right": False}
 _MEASURED = "#1f4e79"
@@ -57,13 +57,13 @@ def trace_figure(trace: Trace, metadata: PolicyMetadata) -> Figure:
     axes[-1].xaxis.set_major_locator(ticker.MaxNLocator(12, integer=True, min_n_ticks=1))
     axes[-1].set_xlim(trace.time[0] - 1 / trace.rate, trace.time[-1])
     figure.align_ylabels(axes)
-    figure.suptitle(_title(trace, metadata), x=0.01, ha="left", fontsize=11)
+    figure.suptitle(_title(trace), x=0.01, ha="left", fontsize=11)
     return figure
 
 
-def _title(trace: Trace, metadata: PolicyMetadata) -> str:
+def _title(trace: Trace) -> str:
     falls = int(trace.fallen.sum())
-    return f"{metadata.robot}, {trace.time[-1]:.3g} s, " + (
+    return f"{trace.title}, " + (
         f"{falls} fall{'s' if falls > 1 else ''} (red lines)" if falls else "no falls"
     )
 

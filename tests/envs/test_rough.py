@@ -9,7 +9,7 @@ import torch
 
 from kiras_rl.config import load_config
 from kiras_rl.envs import make_env
-from kiras_rl.envs.curriculum import CROSSED
+from kiras_rl.envs.terrains import CROSSED
 from kiras_rl.phases import FINETUNING, phase_config
 from kiras_rl.terrain_evaluation import Trials, evaluate_terrain, run_trials
 

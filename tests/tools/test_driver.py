@@ -11,8 +11,8 @@ import torch
 from kiras_rl.deploy.policy import OnboardPolicy, PolicyError
 from kiras_rl.export import export_policy
 from kiras_rl.robots.robot import RobotError
-from kiras_rl.tools.driver import (
-    Driver,
+from kiras_rl.tools.driver import Driver
+from kiras_rl.tools.script import (
     Segment,
     default_script,
     parse_command,

@@ -8,7 +8,8 @@ import torch
 
 from kiras_rl import evaluation
 from kiras_rl.deploy.policy import OnboardPolicy
-from kiras_rl.tools.driver import Driver, Segment, record
+from kiras_rl.tools.driver import Driver
+from kiras_rl.tools.script import Segment, record
 from kiras_rl.tools.summary import (
     AVERAGE,
     SETTLE,
