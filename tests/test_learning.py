@@ -12,8 +12,8 @@ from kiras_rl.envs import make_env
 from kiras_rl.export import export_policy
 from kiras_rl.runner import KirasRunner
 from kiras_rl.tools.driver import Driver
-from kiras_rl.tools.script import Segment, record
 from kiras_rl.tools.evaluator import make_evaluator
+from kiras_rl.tools.script import Segment, record
 
 pytestmark = pytest.mark.slow
 

@@ -13,7 +13,7 @@ from kiras_rl.deploy.metadata import Posture
 from kiras_rl.deploy.policy import OnboardPolicy, PolicyError, PolicyMetadata, projected_gravity
 from kiras_rl.envs.terrains import CROSSED
 from kiras_rl.robots.robot import Robot, RobotError, load_robot
-from kiras_rl.tools.ground import Terrain, Tile, ground_height, terrain_of
+from kiras_rl.tools.ground import FLAT, Terrain, Tile, ground_height, terrain_of
 
 _CONTACT_FORCE = 1.0  # N; less is a graze
 _FALL_COSINE = np.cos(np.deg2rad(60.0))  # gravity this far from the posture: not recoverable
@@ -85,7 +85,7 @@ class Driver:
         self.robot = load_robot(meta.robot)
         _check_joints(self.robot, meta)
         self._terrain = terrain
-        self._build(Tile())
+        self._build(FLAT)
         self.substeps = round(1 / (meta.control_rate * self.model.opt.timestep))
         self._gravity = np.array([_gravity_at(meta.keyframes[s].pitch) for s in meta.skills])
         self._steps = 0
@@ -108,6 +108,12 @@ class Driver:
         if self._terrain is None:
             self._terrain = terrain_of(self.metadata)
         return self._terrain
+
+    @property
+    def scene(self) -> tuple[str, Tile, Terrain | None]:
+        """What it looks like: robot and ground. Equal scenes look the same."""
+        flat = self.tile.is_flat
+        return (self.robot.name, FLAT, None) if flat else (self.robot.name, self.tile, self.terrain)
 
     def show(self, kind: str, level: int = 0, variant: int = 0) -> None:
         """Put a tile under the robot, and the robot on its platform in the posture asked for.

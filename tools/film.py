@@ -14,8 +14,9 @@ import numpy as np
 from matplotlib.figure import Figure
 from PIL import Image, ImageDraw, ImageFont
 
-from kiras_rl.tools.script import Trace
+from kiras_rl.tools.ground import GROUND_GROUP
 from kiras_rl.tools.rendering import RenderError, make_renderer
+from kiras_rl.tools.script import Trace
 
 FRAMES = 8  # pictures in a strip
 STRIP_SECONDS = 1.0
@@ -23,6 +24,8 @@ _FRAME_SIZE = (300, 210)
 _DPI = 150
 _VIDEO_SIZE = (960, 540)
 _VIDEO_RATE = 25
+_AZIMUTH, _ELEVATIONS = 110.0, (-12.0, -24.0, -36.0, -48.0, -60.0)  # degrees; the first that sees
+_SMOOTH = 0.8  # s over which the camera follows the height of the ground
 
 
 class Film:
@@ -45,7 +48,7 @@ class Film:
         self._model, self._data = model, mujoco.MjData(model)
         self._renderer = make_renderer(model, *size)
         self._camera = mujoco.MjvCamera()
-        self._camera.azimuth, self._camera.elevation = 110, -12
+        self._camera.azimuth = _AZIMUTH
         self._camera.distance = 3.3 * tallest
         self._middle = 0.5 * tallest
 
@@ -62,13 +65,28 @@ class Film:
         """Give the OpenGL context back."""
         self._renderer.close()
 
-    def draw(self, qpos: np.ndarray) -> np.ndarray:
-        """Return the picture of a configuration (7 + J,), (height, width, 3) uint8."""
+    def draw(self, qpos: np.ndarray, ground: float = 0.0) -> np.ndarray:
+        """Return the picture of a configuration, (height, width, 3) uint8.
+
+        Args:
+            qpos: The configuration, (7 + J,).
+            ground: Height of the ground under it, m.
+        """
         self._data.qpos[:] = qpos
         mujoco.mj_forward(self._model, self._data)
-        self._camera.lookat[:] = (qpos[0], qpos[1], self._middle)
+        self._aim(np.array([qpos[0], qpos[1], ground + self._middle]))
         self._renderer.update_scene(self._data, self._camera)
         return self._renderer.render()
+
+    def _aim(self, place: np.ndarray) -> None:
+        """Look at a place, (3,), m, from as low as the ground allows."""
+        camera, geom = self._camera, np.zeros(1, np.int32)
+        camera.lookat[:] = place
+        for camera.elevation in _ELEVATIONS:
+            way = -_direction(_AZIMUTH, camera.elevation)
+            free = mujoco.mj_ray(self._model, self._data, place, way, GROUND_GROUP, 1, -1, geom)
+            if not 0 <= free < camera.distance:
+                return
 
 
 def save_strips(trace: Trace, model: mujoco.MjModel, tallest: float, path: Path) -> None:
@@ -79,10 +97,11 @@ def save_strips(trace: Trace, model: mujoco.MjModel, tallest: float, path: Path)
     figure = Figure(figsize=size, layout="constrained")
     figure.get_layout_engine().set(w_pad=0.01, h_pad=0.01, wspace=0, hspace=0)
     axes = figure.subplots(len(rows), FRAMES, squeeze=False)
+    ground = _ground(trace)
     with Film(model, _FRAME_SIZE, tallest) as film:
         for row, line in zip(rows, axes, strict=True):
             for index, axis in zip(row, line, strict=True):
-                axis.imshow(film.draw(trace.qpos[index]))
+                axis.imshow(film.draw(trace.qpos[index], ground[index]))
                 axis.set_xticks([])
                 axis.set_yticks([])
                 axis.spines[:].set_visible(False)
@@ -103,13 +122,14 @@ def save_video(trace: Trace, model: mujoco.MjModel, tallest: float, path: Path) 
     font = ImageFont.truetype(
         str(Path(matplotlib.get_data_path()) / "fonts/ttf/DejaVuSans-Bold.ttf"), 22
     )
+    ground = _ground(trace)
     stride = max(1, round(trace.rate / _VIDEO_RATE))
     with (
         _video_writer(path, trace.rate / stride) as writer,
         Film(model, _VIDEO_SIZE, tallest) as film,
     ):
         for index in range(0, len(trace.time), stride):
-            picture = Image.fromarray(film.draw(trace.qpos[index]))
+            picture = Image.fromarray(film.draw(trace.qpos[index], ground[index]))
             text = _label(trace, index).replace("\n", "   ")
             ImageDraw.Draw(picture).text((24, 20), text, font=font, fill=(20, 30, 40))
             writer.append_data(np.asarray(picture))
@@ -127,6 +147,19 @@ def _strip(trace: Trace, skill: int) -> list[int]:
 
 def _moves(trace: Trace, segment: int) -> bool:
     return bool(np.any(trace.command[trace.segment == segment]))
+
+
+def _ground(trace: Trace) -> np.ndarray:
+    """Return the height of the ground under the robot without its steps, (T,), m."""
+    width = 2 * round(_SMOOTH * trace.rate / 2) + 1
+    heights = np.pad(trace.qpos[:, 2] - trace.base_height, width // 2, mode="edge")
+    return np.convolve(heights, np.full(width, 1 / width), mode="valid")
+
+
+def _direction(azimuth: float, elevation: float) -> np.ndarray:
+    """Return where a camera looks, a unit vector (3,); both angles in degrees, as MuJoCo's."""
+    around, up = np.deg2rad([azimuth, elevation])
+    return np.array([np.cos(up) * np.cos(around), np.cos(up) * np.sin(around), np.sin(up)])
 
 
 def _label(trace: Trace, index: int) -> str:

@@ -16,30 +16,35 @@ from kiras_rl.envs.terrain_library import TerrainLibrary, build_library
 from kiras_rl.phases import FINETUNING, phase_config
 from kiras_rl.schema import Config, TerrainConfig
 
-_FLAT = "flat"
 _ABOVE = 50.0  # m: higher than any tile
 _SPACING = 0.1  # m, of the points under the base, as in training
 _POINTS = _SPACING * np.stack(np.meshgrid([-1, 0, 1], [-1, 0, 1]), axis=-1).reshape(-1, 2)
 _DOWN = np.array([0.0, 0.0, -1.0])
-_GROUND_GROUP = np.array([1, 0, 0, 0, 0, 0], np.uint8)  # group 0 is floor and terrain
+
+GROUND_GROUP = np.array([1, 0, 0, 0, 0, 0], np.uint8)
+"""What a ray may hit: group 0, floor and terrain."""
 
 
 @dataclass(frozen=True)
 class Tile:
     """Which ground: its type, its level of difficulty, its variant."""
 
-    kind: str = _FLAT
+    kind: str = "flat"
     level: int = 0
     variant: int = 0
 
     @property
     def is_flat(self) -> bool:
         """Whether it is the endless floor alone, which has neither levels nor variants."""
-        return self.kind == _FLAT
+        return self.kind == "flat"
 
     def __str__(self) -> str:
         """Write it as `--terrain` takes it."""
-        return _FLAT if self.is_flat else f"{self.kind}:{self.level}:{self.variant}"
+        return "flat" if self.is_flat else f"{self.kind}:{self.level}:{self.variant}"
+
+
+FLAT = Tile()
+"""What there always is."""
 
 
 class Terrain:
@@ -47,14 +52,14 @@ class Terrain:
 
     Attributes:
         config: What they are made from.
-        kinds: Names of the types; the first is flat ground, whether the configuration has it or not.
+        kinds: Names of the types; flat ground comes first and is always there.
     """
 
     def __init__(self, config: TerrainConfig) -> None:
         """Take a configuration."""
         types = {kind: values for kind, values in config.types.items() if values is not None}
         self.config = replace(config, types=types)
-        self.kinds = (_FLAT, *(kind for kind in types if kind != _FLAT))
+        self.kinds = (FLAT.kind, *(kind for kind in types if kind != FLAT.kind))
 
     @property
     def levels(self) -> int:
@@ -90,9 +95,9 @@ class Terrain:
         kind, *numbers = text.split(":")
         if len(numbers) > 2 or not all(number.isdecimal() for number in numbers):
             raise ConfigError(
-                f"a terrain is TYPE[:LEVEL[:VARIANT]], e.g. {self.kinds[-1]}:4, not '{text}'; types: "
-                f"{', '.join(self.kinds)}; levels 0 to {self.levels - 1}, variants 0 to "
-                f"{self.variants - 1}"
+                f"a terrain is TYPE[:LEVEL[:VARIANT]], e.g. {self.kinds[-1]}:4, not '{text}'; "
+                f"types: {', '.join(self.kinds)}; levels 0 to {self.levels - 1}, "
+                f"variants 0 to {self.variants - 1}"
             )
         tile = Tile(kind, *map(int, numbers))
         self.check(tile)
@@ -100,7 +105,7 @@ class Terrain:
 
     def nearest(self, tile: Tile) -> Tile:
         """Return what comes nearest to a tile of another terrain."""
-        kind = tile.kind if tile.kind in self.kinds else _FLAT
+        kind = tile.kind if tile.kind in self.kinds else FLAT.kind
         return Tile(kind, min(tile.level, self.levels - 1), min(tile.variant, self.variants - 1))
 
     def build(self, spec: mujoco.MjSpec, tile: Tile) -> None:
@@ -120,7 +125,7 @@ class Terrain:
 
 
 def terrain_of(metadata: PolicyMetadata) -> Terrain:
-    """Return the terrain of a policy: its run's, else that of its robot's configuration, else base's.
+    """Return the terrain of a policy's run, else of its robot's configuration, else of base.
 
     A run without finetuning has none, and one that this version cannot read counts as such.
     """
@@ -134,7 +139,7 @@ def ground_height(model: mujoco.MjModel, data: mujoco.MjData, place: np.ndarray)
     """
     geom = np.zeros(1, np.int32)
     down = [
-        mujoco.mj_ray(model, data, (*point, _ABOVE), _DOWN, _GROUND_GROUP, 1, -1, geom)
+        mujoco.mj_ray(model, data, (*point, _ABOVE), _DOWN, GROUND_GROUP, 1, -1, geom)
         for point in place + _POINTS
     ]
     return _ABOVE - sum(down) / len(down)

@@ -9,11 +9,12 @@ from pathlib import Path
 
 from rich.console import Console
 
+from kiras_rl.config import ConfigError
 from kiras_rl.deploy.policy import PolicyError
 from kiras_rl.robots.robot import RobotError
 from kiras_rl.tools import policy_files, summary
 from kiras_rl.tools.driver import Driver
-from kiras_rl.tools.ground import Tile, terrain_of
+from kiras_rl.tools.ground import FLAT, terrain_of
 from kiras_rl.tools.rendering import RenderError
 from kiras_rl.tools.script import (
     Segment,
@@ -28,9 +29,9 @@ from kiras_rl.tools.viewer.choices import title_of
 from kiras_rl.tools.viewer.cockpit import Cockpit
 
 _DESCRIPTION = """\
-Drive one simulated robot on flat ground with a trained policy, through the same code that runs on
-a real robot: live in a browser page (what happens without options) or with the keys of a terminal,
-or by a script, which ends in a table of every skill's errors or in pictures.
+Drive one simulated robot with a trained policy, through the same code that runs on a real robot, on
+flat or rough ground: live in a browser page (what happens without options) or with the keys of a
+terminal, or by a script, which ends in a table of every skill's errors or in pictures.
 
 The policy is one of
   RUN          a run folder: its policy.onnx, else checkpoints/best.pt, else checkpoints/latest.pt
@@ -41,6 +42,11 @@ The policy is one of
 Live, the page and --terminal show their keys. With --table, --trace, --frames or --video, or with
 --script or --command alone, a script is driven: without --script the robot stands for one second
 and then shows every skill for four. A robot that falls is put back into the posture of its skill.
+
+--terrain stairs:4:1 is variant 1 of level 4 of the stairs; level and variant are 0 where they are
+left out. The tiles are those of the policy's run, or else of its robot's configuration; odd
+variants of stairs and slopes lead down. At the end of its tile the robot starts again in the
+middle.
 Exit status: 0, also after Ctrl-C, or 2 if something was wrong with what was given.
 """
 
@@ -51,6 +57,7 @@ examples:
   kiras-play --host 0.0.0.0 --port 9000             let other machines see the page, and drive
   kiras-play --terminal                             drive with keys where there is no browser
   kiras-play runs/solo8/2026-01-01_12-00-00 --follow    watch a training: newest checkpoint
+  kiras-play --terrain stairs:4                     on stairs, live; or with what follows
   kiras-play --table                                every skill's errors
   kiras-play --trace trace.png                      posture, speed, contacts, torques over time
   kiras-play --frames strip.png --video walk.mp4    pictures and a film
@@ -80,7 +87,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             _play(options)
     except KeyboardInterrupt:
         return 0
-    except (PolicyError, RobotError, RenderError, LiveError, OSError) as error:
+    except (PolicyError, RobotError, RenderError, LiveError, ConfigError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
     return 0
@@ -105,6 +112,7 @@ def _parser() -> argparse.ArgumentParser:
         metavar="V_X[,V_Y[,YAW]]",
         help="command for every skill, m/s and rad/s (0.3)",
     )
+    add("--terrain", metavar="TYPE[:LEVEL[:VARIANT]]", help="ground to drive on, as above (flat)")
     add("--table", action="store_true", help="print every skill's errors")
     for name, (endings, text) in _OUTPUTS.items():
         add(name, type=_file(endings), metavar="FILE", help=f"{text} ({' '.join(endings)})")
@@ -147,7 +155,8 @@ def _drive(options: argparse.Namespace) -> None:
     else:
         policy = policy_files.load_policy(source, options.robot)
     shipped = source or policy_files.shipped_policy(policy.metadata.robot)
-    cockpit = Cockpit(policy, title_of(shipped))
+    tile = terrain_of(policy.metadata).parse(options.terrain) if options.terrain else FLAT
+    cockpit = Cockpit(policy, title_of(shipped), tile=tile)
     follow = source if options.follow else None
     if options.screenshot:
         live.save_screenshot(cockpit, options.screenshot, speed=_SCREENSHOT_SPEED)
@@ -161,6 +170,9 @@ def _drive(options: argparse.Namespace) -> None:
 def _play(options: argparse.Namespace) -> None:
     """Drive a script, and show how it went."""
     driver = Driver(policy_files.load_policy(options.policy, options.robot))
+    if options.terrain:
+        tile = driver.terrain.parse(options.terrain)
+        driver.show(tile.kind, tile.level, tile.variant)
     trace = record(driver, _script(options, driver))
     if options.table or not (options.trace or options.frames or options.video):
         rows = summary.summarize(trace, driver.metadata)

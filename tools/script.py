@@ -10,7 +10,7 @@ import numpy as np
 
 from kiras_rl.deploy.policy import PolicyError, PolicyMetadata
 from kiras_rl.tools.driver import Driver, Sample
-from kiras_rl.tools.ground import Tile
+from kiras_rl.tools.ground import FLAT
 
 
 @dataclass(frozen=True)
@@ -57,9 +57,14 @@ class Trace:
     """Index of the script's segment, (T,)."""
 
     @property
+    def is_flat(self) -> bool:
+        """Whether it was driven on the endless floor."""
+        return self.terrain == str(FLAT)
+
+    @property
     def title(self) -> str:
         """Robot, ground and duration, for a heading."""
-        ground = "" if self.terrain == str(Tile()) else f" on {self.terrain}"
+        ground = "" if self.is_flat else f" on {self.terrain}"
         return f"{self.robot}{ground}, {self.time[-1]:.3g} s"
 
     def save(self, path: str | Path) -> None:

@@ -94,7 +94,7 @@ def _summarize(trace: Trace, metadata: PolicyMetadata, skill: int) -> SkillSumma
         velocity_error=float(np.abs(speed - command).mean()),
         lifts=float(lifts_per_second(trace.foot_contact, rows, trace.rate).min()),
         falls=int(trace.fallen[mine].sum()),
-        crossings=None if trace.terrain == "flat" else int(trace.crossed[mine].sum()),
+        crossings=None if trace.is_flat else int(trace.crossed[mine].sum()),
     )
 
 

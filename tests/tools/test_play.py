@@ -45,6 +45,17 @@ def test_a_table_of_every_skill_is_printed(still_file, capsys):
         assert skill in out
 
 
+def test_a_script_is_driven_on_terrain(still_file, tmp_path, capsys):
+    path = tmp_path / "trace.npz"
+    arguments = [str(still_file), SHORT, "--terrain", "stairs:4:1", "--table", "--trace", str(path)]
+    assert main(arguments) == 0
+    out = capsys.readouterr().out
+    assert "solo8 on stairs:4:1, 0.8 s" in out
+    assert "crossed" in out
+    trace = np.load(path)
+    assert trace["qpos"][0, 2] > trace["base_height"][0] + 0.5  # on a platform of eleven steps
+
+
 def test_a_trace_is_drawn(still_file, tmp_path, capsys):
     path = tmp_path / "new" / "trace.png"
     assert main([str(still_file), SHORT, "--trace", str(path)]) == 0
@@ -91,7 +102,16 @@ def test_help_reads_like_a_manual(capsys):
         main(["--help"])
     assert leaving.value.code == 0
     out = capsys.readouterr().out
-    words = ("examples:", "--follow", "--terminal", "--trace", "--script", "RUN", "CHECKPOINT")
+    words = (
+        "examples:",
+        "--follow",
+        "--terminal",
+        "--trace",
+        "--script",
+        "--terrain",
+        "RUN",
+        "CHECKPOINT",
+    )
     for word in (*words, "kiras-play --frames"):
         assert word in out
 
@@ -116,6 +136,11 @@ def error_of(capsys):
         (["--script", "fly:4:0.3"], "unknown skill 'fly' in the script; this policy has: walk,"),
         (["--script", "walk"], "a script's part is skill:seconds:v_x"),
         (["--command", "fast"], "a command is v_x[,v_y[,yaw_rate]], e.g. 0.3"),
+        (
+            ["--terrain", "ice"],
+            "no terrain 'ice'; there are: flat, slopes, bars, footholds, stairs",
+        ),
+        (["--terrain", "stairs:12", "--table"], "no terrain level 12; it goes from 0 to 9"),
         (["--robot", "go1"], "--robot go1 was given, but"),
         (["--follow"], "only a run can be followed, such as runs/solo8/<time>, not "),
         (["--host", "999.1.1.1"], "cannot listen on --host 999.1.1.1"),

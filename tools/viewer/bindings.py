@@ -25,14 +25,19 @@ PRESSED = {
     "T": Cockpit.toggle_pause,
     "N": Cockpit.single_step,
     "M": Cockpit.next_speed,
+    "F": Cockpit.next_terrain,
+    "K": Cockpit.lower_level,
+    "L": Cockpit.raise_level,
+    "V": Cockpit.next_variant,
 }
 """Keys that act once; the digits 1 to 9 choose a skill."""
 
 HELP = (
     "1..9 skill   W S faster, slower   A D turn   Q E sideways   Space stop",
     "P push   R reset   T pause   N one step   M slow motion",
+    "F next terrain   K L level down, up   V next variant",
 )
-"""All of them, in two lines."""
+"""All of them, in three lines."""
 
 
 def press(cockpit: Cockpit, key: str) -> bool:

@@ -1,13 +1,16 @@
-"""What can be driven here: the shipped policies and those of runs."""
+"""What can be driven here, the shipped policies and those of runs; and on which ground."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from kiras_rl.deploy.policy import PolicyError
 from kiras_rl.robots.robot import ROBOTS, list_robots
 from kiras_rl.tools.policy_files import CHECKPOINTS, find_policy
+from kiras_rl.tools.viewer.cockpit import Cockpit
+from kiras_rl.tools.viewer.view import Selector
 
 RUNS = Path("runs")
 """Where kiras-train puts its runs, seen from the folder in which a command is called."""
@@ -49,6 +52,46 @@ def newest_checkpoint(run: Path) -> Path | None:
     if not (run / "config.yaml").is_file():
         raise PolicyError(f"only a run can be followed, such as runs/solo8/<time>, not {run}")
     return max(_checkpoints(run), key=lambda path: path.stat().st_mtime_ns, default=None)
+
+
+def terrain_selectors(cockpit: Cockpit) -> list[Selector]:
+    """Return the lists that the ground is chosen from: type, level and variant."""
+
+    def choose(**changes: str | int) -> None:
+        cockpit.post(partial(cockpit.choose_tile, **changes))
+
+    def numbered(name: str, count: int) -> list[str]:
+        return [f"{name} {number}" for number in range(count)]
+
+    def current(name: str, number: int) -> str:
+        return f"no {name}s" if cockpit.tile.is_flat else f"{name} {number}"
+
+    return [
+        Selector(
+            "terrain",
+            heading="Terrain",
+            options=lambda: cockpit.terrain.kinds,
+            current=lambda: cockpit.tile.kind,
+            choose=lambda index: choose(kind=cockpit.terrain.kinds[index]),
+            keys="F",
+        ),
+        Selector(
+            "level",
+            options=lambda: numbered("level", cockpit.terrain.levels),
+            current=lambda: current("level", cockpit.tile.level),
+            choose=lambda index: choose(level=index),
+            keys="K L",
+            share=2,
+        ),
+        Selector(
+            "variant",
+            options=lambda: numbered("variant", cockpit.terrain.variants),
+            current=lambda: current("variant", cockpit.tile.variant),
+            choose=lambda index: choose(variant=index),
+            keys="V",
+            share=2,
+        ),
+    ]
 
 
 def _checkpoints(run: Path) -> list[Path]:

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import queue
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
+from kiras_rl.config import ConfigError
 from kiras_rl.deploy.policy import OnboardPolicy
 from kiras_rl.tools.driver import Driver, Sample
+from kiras_rl.tools.ground import FLAT, Terrain, Tile, terrain_of
 from kiras_rl.tools.viewer.telemetry import Telemetry
 
 AXES = ("v_x", "v_y", "yaw rate")
@@ -40,27 +43,36 @@ class Cockpit:
         push_speed: Velocity that a push adds, m/s.
         pushes: How often it was pushed.
         falls: How often it had to be put back.
+        crossings: How often it came to the end of its tile, and started again in the middle.
         notice: The last thing worth telling, or an empty text.
     """
 
-    def __init__(self, policy: OnboardPolicy, title: str = "policy", seed: int = 0) -> None:
+    def __init__(
+        self,
+        policy: OnboardPolicy,
+        title: str = "policy",
+        seed: int = 0,
+        tile: Tile = FLAT,
+    ) -> None:
         """Stand in the first skill's posture, commanded to stand.
 
         Args:
             policy: What drives.
             title: What it is called.
             seed: Of the directions of pushes.
+            tile: The ground to start on.
 
         Raises:
             RobotError: If the robot of the policy is unknown or has other joints.
+            ConfigError: If there is no such tile.
         """
         self._inbox: queue.SimpleQueue[tuple[Callable[..., Any], tuple]] = queue.SimpleQueue()
         self._generator = np.random.default_rng(seed)
         self.paused, self._single_step = False, False
         self.speed, self.push_speed = SPEEDS[0], 0.5
-        self.pushes, self.falls, self.notice = 0, 0, ""
+        self.pushes, self.falls, self.crossings, self.notice = 0, 0, 0, ""
         self.skill = 0
-        self._install(Driver(policy), title)
+        self._install(_drive(policy, terrain_of(policy.metadata), tile), title)
 
     def _install(self, driver: Driver, title: str) -> None:
         meta = driver.metadata
@@ -138,14 +150,20 @@ class Cockpit:
         self.driver.reset(self.skill)
 
     def load(self, policy: OnboardPolicy, title: str) -> None:
-        """Drive with another policy; with the same robot and skills, in full stride.
+        """Drive with another policy; with the same robot, skills and ground, in full stride.
+
+        The tile stays as long as the policy's terrain has it.
 
         Raises:
             RobotError: If the robot of the policy is unknown or has other joints.
+            ConfigError: If its terrain cannot be made.
         """
-        old, driver = self.driver, Driver(policy)
+        old, terrain = self.driver, terrain_of(policy.metadata)
+        if terrain.config == self.terrain.config:
+            terrain = self.terrain  # its tiles are made
+        driver = _drive(policy, terrain, terrain.nearest(old.tile))
         target, command, telemetry = self.target, self.command, self.telemetry
-        same = old.metadata.skills == policy.metadata.skills and old.robot.name == driver.robot.name
+        same = old.metadata.skills == policy.metadata.skills and old.scene == driver.scene
         self._install(driver, title)
         if same:
             driver.take_over(old)
@@ -155,6 +173,57 @@ class Cockpit:
         else:
             self.skill = 0
             self.reset()
+
+    # --- the ground ------------------------------------------------------------------------------
+
+    @property
+    def terrain(self) -> Terrain:
+        """The tiles to choose from."""
+        return self.driver.terrain
+
+    @property
+    def tile(self) -> Tile:
+        """The ground that the robot is on."""
+        return self.driver.tile
+
+    def choose_tile(self, **changes: str | int) -> None:
+        """Put another tile under the robot, which then stands in its middle.
+
+        Args:
+            changes: What is to be other than now: `kind`, `level` or `variant`.
+        """
+        tile = replace(self.tile, **changes)
+        if tile.is_flat and self.tile.is_flat:
+            self.notice = "flat ground has neither levels nor variants: choose a terrain first"
+            return
+        try:
+            self.driver.show(tile.kind, tile.level, tile.variant)
+        except ConfigError as error:
+            self.notice = str(error)
+        else:
+            self.reset()
+
+    def next_terrain(self) -> None:
+        """Go on to the next type of terrain."""
+        kinds = self.terrain.kinds
+        self.choose_tile(kind=kinds[(kinds.index(self.tile.kind) + 1) % len(kinds)])
+
+    def raise_level(self) -> None:
+        """Make the terrain more difficult, up to its top level."""
+        self._change_level(1)
+
+    def lower_level(self) -> None:
+        """Make the terrain easier, down to its lowest level."""
+        self._change_level(-1)
+
+    def _change_level(self, change: int) -> None:
+        level = int(np.clip(self.tile.level + change, 0, self.terrain.levels - 1))
+        if self.tile.is_flat or level != self.tile.level:
+            self.choose_tile(level=level)
+
+    def next_variant(self) -> None:
+        """Go on to the next tile of the same type and level."""
+        self.choose_tile(variant=(self.tile.variant + 1) % self.terrain.variants)
 
     # --- time ------------------------------------------------------------------------------------
 
@@ -197,6 +266,9 @@ class Cockpit:
         sample = self.driver.step(after_substep)
         self.telemetry.add(sample, self.driver.posture, self.driver.policy.velocity)
         self._watch_fall(sample, dt)
+        if sample.crossed:
+            self.crossings += 1
+            self.driver.reset(self.skill)
         return sample
 
     def _move_target(self, dt: float) -> None:
@@ -217,3 +289,10 @@ class Cockpit:
             self.falls += 1
             self.notice = f"fell in {self.skills[self.skill]}: put back"
             self.reset()
+
+
+def _drive(policy: OnboardPolicy, terrain: Terrain, tile: Tile) -> Driver:
+    driver = Driver(policy, terrain)
+    if not tile.is_flat:
+        driver.show(tile.kind, tile.level, tile.variant)
+    return driver

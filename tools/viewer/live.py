@@ -50,8 +50,7 @@ def open_page(
 
     def show() -> None:
         nonlocal stage
-        if stage.driver is not cockpit.driver:
-            stage = stage.move_to(cockpit.driver)
+        stage = stage.move_to(cockpit.driver)
         stage.pose(view.side)
         page.show(stage)
         page.check()

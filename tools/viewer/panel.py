@@ -14,7 +14,7 @@ from kiras_rl.tools.viewer.stage import GHOST_GROUP
 from kiras_rl.tools.viewer.view import View
 
 _CONTROLS, _PLOTS, _GAP = 264.0, 304.0, 12.0  # pixels: two windows' widths, and around them
-_HEIGHT, _PLOT_HEIGHT = 716.0, 166.0
+_HEIGHT, _PLOT_HEIGHT = 740.0, 172.0
 _HOLD = 0.15  # s until a key that is not seen any more counts as let go
 _AXIS_KEYS = {FORWARD: "W S", LEFT: "Q E", YAW: "A D"}
 _UNITS = {FORWARD: "m/s", LEFT: "m/s", YAW: "rad/s"}
@@ -33,6 +33,7 @@ class Panel(plugin.ViewerPlugin):
     def __init__(self, cockpit: Cockpit, view: View) -> None:
         """Keep both; they are read in every frame."""
         self.cockpit, self.view = cockpit, view
+        self._robot = ""
 
     @messages.handler
     def on_start(self, event: plugin.ViewerInitEvent) -> None:
@@ -41,9 +42,12 @@ class Panel(plugin.ViewerPlugin):
 
     @messages.handler
     def on_model(self, event: messages.PostModelEvent) -> None:
-        """Point the camera at the robot."""
-        camera = self.viewer.camera
-        tallest = max(p.base_height for p in self.cockpit.driver.metadata.keyframes.values())
+        """Point the camera at the robot; on another ground it stays as it was turned."""
+        camera, driver = self.viewer.camera, self.cockpit.driver
+        if driver.robot.name == self._robot:
+            return
+        self._robot = driver.robot.name
+        tallest = max(p.base_height for p in driver.metadata.keyframes.values())
         mujoco.mjv_defaultFreeCamera(self.viewer.model, camera)
         camera.azimuth, camera.elevation, camera.distance = 130, -16, 5.5 * tallest
         camera.trackbodyid = _BASE_BODY
@@ -85,8 +89,7 @@ class Panel(plugin.ViewerPlugin):
     # --- left: controls --------------------------------------------------------------------------
 
     def _controls(self) -> None:
-        for selector in self.view.selectors:
-            widgets.selector(selector)
+        widgets.selectors(self.view.selectors)
         widgets.heading("Skill")
         for index, name in enumerate(self.cockpit.skills):
             chosen = index == self.cockpit.skill
@@ -132,16 +135,17 @@ class Panel(plugin.ViewerPlugin):
             self.cockpit.push_speed = value
 
     def _view_row(self) -> None:
-        if widgets.button(f"Ghost {self.view.ghost}", "G", False, share=1):
+        if widgets.button(f"Ghost {self.view.ghost}", "G", False, share=2):
             self.view.next_ghost()
-        label = "Camera follows" if self.view.follow else "Camera stays"
-        if widgets.button(label, "C", False, share=1):
+        imgui.SameLine()
+        if widgets.button("Follow", "C", self.view.follow, share=2):
             self.view.follow = not self.view.follow
 
     def _status(self) -> None:
         cockpit = self.cockpit
         imgui.Spacing()
-        widgets.faint(f"real time {self.view.real_time:.2f} x    falls {cockpit.falls}")
+        crossings = "" if cockpit.tile.is_flat else f"    crossed {cockpit.crossings}"
+        widgets.faint(f"real time {self.view.real_time:.2f} x    falls {cockpit.falls}{crossings}")
         for text in (self.view.gamepad, cockpit.notice):
             if text:
                 widgets.faint(text)

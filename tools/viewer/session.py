@@ -6,8 +6,9 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+from kiras_rl.config import ConfigError
 from kiras_rl.robots.robot import RobotError
-from kiras_rl.tools.viewer.choices import RUNS, list_choices, title_of
+from kiras_rl.tools.viewer.choices import RUNS, list_choices, terrain_selectors, title_of
 from kiras_rl.tools.viewer.clock import Clock
 from kiras_rl.tools.viewer.cockpit import Cockpit
 from kiras_rl.tools.viewer.gamepad import NAMES, Gamepad
@@ -36,7 +37,7 @@ class Session:
         Args:
             cockpit: What is driven.
             show: Is called after every step, in slow motion after every physics step.
-            view: Is told about the clock and the gamepad, and gets the list of policies.
+            view: Is told about the clock and the gamepad, and gets the lists to choose from.
             follow: Run whose checkpoints are loaded as they appear.
             runs: Folder of runs to choose from.
 
@@ -52,12 +53,14 @@ class Session:
         titles = [choice.title for choice in choices]
         self.view.selectors.append(
             Selector(
-                "Robot and policy",
+                "policy",
+                heading="Robot and policy",
                 options=lambda: titles,
                 current=lambda: cockpit.title,
                 choose=lambda index: self._choose(choices[index].path, titles[index]),
             )
         )
+        self.view.selectors += terrain_selectors(cockpit)
 
     def run(self, seconds: float = float("inf")) -> None:
         """Go on until closed, or for some seconds of the world."""
@@ -110,7 +113,7 @@ class Session:
             return
         try:
             self.cockpit.load(loaded.policy, loaded.title)
-        except RobotError as error:
+        except (RobotError, ConfigError) as error:
             self.cockpit.notice = str(error)
         else:
             self.cockpit.notice = f"loaded at {time.strftime('%H:%M:%S')}"

@@ -37,11 +37,11 @@ class Stage:
         _dress(spec)
         self.model = spec.compile()
         self.data = mujoco.MjData(self.model)
-        self._own = driver.model.nq
+        self._own, self._scene = driver.model.nq, driver.scene
 
     def move_to(self, driver: Driver) -> Stage:
-        """Return the stage of another driver: this one, if its robot looks the same."""
-        if driver.robot.name != self.driver.robot.name:
+        """Return the stage of a driver as it is now: this one if robot and ground are the same."""
+        if driver.scene != self._scene:
             return Stage(driver)
         self.driver = driver
         return self
@@ -55,11 +55,15 @@ class Stage:
         qpos = self.driver.data.qpos
         self.data.time = self.driver.data.time
         self.data.qpos[: self._own] = qpos
-        self.data.qpos[self._own :] = ghost_pose(qpos, self.driver.posture, side)
+        ghost = ghost_pose(qpos, self.driver.posture, side)
+        ghost[2] += self.driver.ground_height(ghost[:2])
+        self.data.qpos[self._own :] = ghost
 
 
 def ghost_pose(qpos: np.ndarray, posture: Posture, side: float = 0.0) -> np.ndarray:
     """Return the configuration of a keyframe at a robot's place and heading, (7 + J,).
+
+    It stands on flat ground.
 
     Args:
         qpos: Configuration of the robot, (7 + J,).

@@ -97,7 +97,7 @@ def lines(cockpit: Cockpit, view: View) -> list[str]:
         f"[{i + 1} {name}]" if i == cockpit.skill else f" {i + 1} {name} "
         for i, name in enumerate(cockpit.skills)
     )
-    text = [cockpit.title, "", skills, ""]
+    text = [cockpit.title, f"terrain {cockpit.tile}", "", skills, ""]
     text += [
         f"{AXES[axis]:>14} {_bar(cockpit.target[axis], cockpit.limits[axis])} "
         f"{cockpit.target[axis]:+.2f}"
@@ -107,7 +107,9 @@ def lines(cockpit: Cockpit, view: View) -> list[str]:
     if len(kept["time"]):
         last = {name: float(column[-1]) for name, column in kept.items()}
         text += ["", f"{'':14} {'is':>8} {'target':>8}", *_rows(last)]
-    text += ["", f"{state}   real time {view.real_time:.2f} x   falls {cockpit.falls}"]
+    crossings = "" if cockpit.tile.is_flat else f"   crossed {cockpit.crossings}"
+    counts = f"falls {cockpit.falls}{crossings}"
+    text += ["", f"{state}   real time {view.real_time:.2f} x   {counts}"]
     return [*text, cockpit.notice, "", *bindings.HELP, "X leave"]
 
 

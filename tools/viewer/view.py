@@ -11,13 +11,20 @@ GHOSTS = {"off": 0.0, "inside": 0.0, "beside": 0.45}
 
 @dataclass(frozen=True)
 class Selector:
-    """A list to choose from: policies today; whatever else the driver can be built with."""
+    """A list to choose from: policies, the ground."""
 
     label: str
+    """Unique among all of them."""
     options: Callable[[], Sequence[str]]
     current: Callable[[], str]
     choose: Callable[[int], None]
     """Is called, from the page's thread, with the index of what was chosen."""
+    heading: str = ""
+    """Written above it; without one it stays below what comes before."""
+    keys: str = ""
+    """The keys that do the same."""
+    share: int = 1
+    """How many of its kind stand in a row."""
 
 
 @dataclass

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 
 from mujoco.studio.dear_imgui import dear_imgui as imgui
@@ -33,6 +33,7 @@ _WINDOW = (
     | imgui.WindowFlags.NoSavedSettings.value
     | imgui.WindowFlags.NoFocusOnAppearing.value
 )
+_PLAIN = imgui.ComboFlags.NoArrowButton.value  # where the arrow would be there is a key
 
 
 @contextmanager
@@ -89,12 +90,9 @@ def button(label: str, key: str, chosen: bool, share: int = 1) -> bool:
         chosen: Whether it is lit.
         share: How many buttons have to fit into a row.
     """
-    gap = 6.0
-    whole = imgui.GetWindowWidth() - 24.0
-    width = (whole - (share - 1) * gap) / share
     if chosen:
         imgui.PushStyleColor(int(imgui.Col.Button), imgui.Vec4(*_ACCENT))
-    pressed = imgui.Button(f"{label}##{key}", imgui.Vec2(width, 0))
+    pressed = imgui.Button(f"{label}##{key}", imgui.Vec2(_width(share), 0))
     if chosen:
         imgui.PopStyleColor(1)
     _key_at_end(key, _BRIGHT if chosen else _FAINT)
@@ -124,17 +122,40 @@ def slider(
     return changed, value
 
 
-def selector(choice: Selector) -> None:
-    """Draw a list to choose from."""
-    heading(choice.label)
-    imgui.SetNextItemWidth(imgui.GetWindowWidth() - 24.0)
+def selectors(choices: Sequence[Selector]) -> None:
+    """Draw lists to choose from; those that share a row follow one another."""
+    filled = 1.0  # of the row
+    for choice in choices:
+        if choice.heading:
+            heading(choice.heading)
+            filled = 1.0
+        part = 1 / choice.share
+        if filled + part > 1 + 1e-9:
+            filled = 0.0
+        else:
+            imgui.SameLine()
+        filled += part
+        _selector(choice)
+
+
+def _selector(choice: Selector) -> None:
+    imgui.SetNextItemWidth(_width(choice.share))
     current = choice.current()
-    if not imgui.BeginCombo(f"##{choice.label}", current):
+    opened = imgui.BeginCombo(f"##{choice.label}", current, _PLAIN if choice.keys else 0)
+    if choice.keys:
+        _key_at_end(choice.keys, _FAINT)
+    if not opened:
         return
     for index, option in enumerate(choice.options()):
         if imgui.Selectable(f"{option}##{index}", option == current):
             choice.choose(index)
     imgui.EndCombo()
+
+
+def _width(share: int) -> float:
+    """Return the width of a widget of which so many have to fit into a row."""
+    gap = 6.0
+    return (imgui.GetWindowWidth() - 24.0 - (share - 1) * gap) / share
 
 
 def _key_at_end(key: str, rgba: tuple[float, float, float, float]) -> None:

@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 import torch
 
+from kiras_rl.config import config_to_dict, load_config
 from kiras_rl.deploy.policy import OnboardPolicy, PolicyError
 from kiras_rl.export import export_policy
+from kiras_rl.tools.ground import FLAT, Tile
 from kiras_rl.tools.viewer import bindings
 from kiras_rl.tools.viewer.cockpit import FALL_SECONDS, FORWARD, LEFT, SPEEDS, YAW, Cockpit
 
@@ -223,3 +225,70 @@ def test_only_a_policy_with_an_estimator_has_an_estimate(
     without = Cockpit(OnboardPolicy(tmp_path / "b.onnx"))
     run(without, 0.1)
     assert np.isnan(without.telemetry.view()["estimate_x"]).all()
+
+
+def press(cockpit, keys):
+    for key in keys:
+        assert bindings.press(cockpit, key)
+    cockpit.advance()
+
+
+def test_keys_choose_the_ground(cockpit):
+    press(cockpit, "F")
+    assert cockpit.tile == Tile("slopes", 0, 0)
+    press(cockpit, "LLVK")
+    assert cockpit.tile == Tile("slopes", 1, 1)
+    press(cockpit, "K" * 3 + "V" * 3)
+    assert cockpit.tile == Tile("slopes", 0, 0)
+    press(cockpit, "L" * 12)
+    assert cockpit.tile == Tile("slopes", 9, 0)
+    press(cockpit, "F" * 4)
+    assert cockpit.tile.is_flat
+
+
+def test_flat_ground_has_no_levels_and_says_so(cockpit):
+    press(cockpit, "L")
+    assert cockpit.tile == FLAT
+    assert "neither levels nor variants" in cockpit.notice
+
+
+def test_on_another_ground_it_stands_in_the_chosen_skill(cockpit):
+    cockpit.choose_skill("stilt")
+    cockpit.set_target(FORWARD, 0.3)
+    run(cockpit, 0.5)
+    cockpit.choose_tile(kind="stairs", level=4)
+    assert cockpit.skill == 2
+    assert not cockpit.target.any()
+    height = cockpit.driver.metadata.keyframes["stilt"].base_height
+    assert cockpit.advance().base_height == pytest.approx(height, abs=0.02)
+
+
+def test_at_the_end_of_a_tile_it_goes_on_in_the_middle(cockpit):
+    cockpit.choose_tile(kind="bars")
+    cockpit.set_target(FORWARD, 0.3)
+    cockpit.driver.data.qpos[0] = 3.8
+    assert cockpit.advance().crossed
+    assert (cockpit.crossings, cockpit.falls) == (1, 0)
+    assert cockpit.driver.data.qpos[0] == 0
+    assert cockpit.target[FORWARD] == 0.3
+
+
+def test_another_policy_takes_over_on_the_same_ground(cockpit, exported):
+    cockpit.choose_tile(kind="stairs", level=4, variant=1)
+    run(cockpit, 0.2)
+    qpos = cockpit.driver.data.qpos.copy()
+    cockpit.load(OnboardPolicy(exported[2]), "another")
+    assert cockpit.tile == Tile("stairs", 4, 1)
+    np.testing.assert_array_equal(cockpit.driver.data.qpos, qpos)
+
+
+def test_a_policy_of_another_terrain_stands_on_its_own(
+    cockpit, make_metadata, make_policy, tmp_path
+):
+    config = load_config("base", ["finetuning.env.terrain.levels=3"])
+    metadata = make_metadata(provenance={"config": config_to_dict(config)})
+    export_policy(make_policy(metadata, gain=0.0), metadata, tmp_path / "a.onnx")
+    cockpit.choose_tile(kind="stairs", level=4)
+    cockpit.load(OnboardPolicy(tmp_path / "a.onnx"), "three levels")
+    assert cockpit.tile == Tile("stairs", 2, 0)
+    assert cockpit.advance().base_height == pytest.approx(0.2, abs=0.05)

@@ -130,7 +130,7 @@ def test_choosing_a_policy_changes_what_drives(still_file, exported, tmp_path):
     shutil.copy(exported[2], run / "policy.onnx")
     cockpit, view = Cockpit(OnboardPolicy(still_file)), View()
     session = Session(cockpit, lambda: None, view, runs=tmp_path / "runs")
-    (selector,) = view.selectors
+    selector = view.selectors[0]
     selector.choose(selector.options().index("solo8/now"))
     session.run(seconds=2.0)
     assert selector.current() == cockpit.title == "solo8/now"

@@ -136,6 +136,13 @@ def test_the_picture_is_not_blank(tab):
     assert picture[100:220, 180:300].std() > 5
 
 
+def test_a_key_changes_the_ground_and_the_page_goes_on(drive, tab):
+    cockpit, _ = drive
+    press_until(tab, "f", lambda: not cockpit.tile.is_flat)
+    press_until(tab, "l", lambda: cockpit.tile.level > 0)
+    choose(cockpit, tab, "2")
+
+
 def test_a_second_viewer_watches_and_closing_the_tab_ends_nothing(drive, tab):
     """The second one speaks as a tab does but draws nothing: two would starve each other here."""
     cockpit, url = drive

@@ -13,6 +13,7 @@ import time
 import pytest
 
 from kiras_rl.deploy.policy import OnboardPolicy
+from kiras_rl.tools.ground import Tile
 from kiras_rl.tools.viewer.cockpit import FORWARD, Cockpit
 from kiras_rl.tools.viewer.terminal import lines
 from kiras_rl.tools.viewer.view import View
@@ -70,4 +71,13 @@ def test_the_screen_says_what_is_and_what_is_asked_for(still_file):
     text = "\n".join(lines(cockpit, View()))
     for part in ("my policy", "[2 crawl]", "v_x", "+0.30", "10.0", "estimated v_x", "P push"):
         assert part in text
+    assert "terrain flat" in text
+    assert "crossed" not in text
     assert "v_y" not in text  # this policy does not move sideways
+
+
+def test_the_screen_names_the_ground_and_counts_tiles(still_file):
+    cockpit = Cockpit(OnboardPolicy(still_file), tile=Tile("stairs", 4, 1))
+    text = "\n".join(lines(cockpit, View()))
+    for part in ("terrain stairs:4:1", "crossed 0", "F next terrain"):
+        assert part in text
