@@ -148,7 +148,6 @@ def test_it_stands_on_every_platform_in_its_keyframe(policy, terrain, kind, vari
     samples = [driver.step() for _ in range(75)]
     assert not any(sample.fallen or sample.crossed for sample in samples)
     assert samples[-1].base_height == pytest.approx(driver.posture.base_height, abs=0.03)
-    assert samples[-1].foot_contact.all()
 
 
 def test_on_a_tile_the_feet_begin_just_above_the_platform(still_file, smooth_terrain):

@@ -97,7 +97,7 @@ def lines(cockpit: Cockpit, view: View) -> list[str]:
         f"[{i + 1} {name}]" if i == cockpit.skill else f" {i + 1} {name} "
         for i, name in enumerate(cockpit.skills)
     )
-    text = [cockpit.title, f"terrain {cockpit.tile}", "", skills, ""]
+    text = [f"{cockpit.title}   terrain {cockpit.tile}", "", skills, ""]
     text += [
         f"{AXES[axis]:>14} {_bar(cockpit.target[axis], cockpit.limits[axis])} "
         f"{cockpit.target[axis]:+.2f}"
