@@ -142,9 +142,9 @@ def _selector(choice: Selector) -> None:
     imgui.SetNextItemWidth(_width(choice.share))
     current = choice.current()
     opened = imgui.BeginCombo(f"##{choice.label}", current, _PLAIN if choice.keys else 0)
-    if choice.keys:
-        _key_at_end(choice.keys, _FAINT)
     if not opened:
+        if choice.keys:
+            _key_at_end(choice.keys, _FAINT)
         return
     for index, option in enumerate(choice.options()):
         if imgui.Selectable(f"{option}##{index}", option == current):
