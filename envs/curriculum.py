@@ -34,14 +34,17 @@ class Curriculum:
         level: Difficulty, (N, S).
     """
 
-    def __init__(self, library: TerrainLibrary, num_skills: int, random: UniformBuffer) -> None:
-        """Deal the types to the worlds by their proportions; begin at the lowest level."""
+    def __init__(
+        self, library: TerrainLibrary, num_skills: int, random: UniformBuffer, start_level: int
+    ) -> None:
+        """Deal the types to the worlds by their proportions, and levels up to `start_level`."""
         self._library, self._random = library, random
         n, device = len(random["terrain"]), random["terrain"].device
         edges = torch.tensor(library.proportions, device=device).cumsum(0)
         middle = (torch.arange(n, device=device) + 0.5) / n
         self.kind = torch.searchsorted(edges, middle.double()).clamp(max=len(library.types) - 1)
-        self.level = torch.zeros(n, num_skills, dtype=torch.int64, device=device)
+        drawn = torch.rand(n, num_skills, generator=random.generator, device=device)
+        self.level = (drawn * (min(start_level, library.levels - 1) + 1)).long()
         self._way = torch.zeros(n, device=device)
         self._gone = torch.zeros(n, device=device)
         self._pure = torch.ones(n, dtype=torch.bool, device=device)

@@ -106,7 +106,9 @@ class QuadrupedEnv(SkillEnv):
         self._randomizer = Randomizer(cfg.randomization, self._scene, self.sim, self._random)
         self._curriculum = None
         if self._library:
-            self._curriculum = Curriculum(self._library, len(self.skills), self._random)
+            self._curriculum = Curriculum(
+                self._library, len(self.skills), self._random, cfg.terrain.start_level
+            )
         self._placed: torch.Tensor | None = None  # tiles chosen from outside, (N,)
 
     def _begin(self) -> None:

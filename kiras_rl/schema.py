@@ -98,6 +98,7 @@ class TerrainConfig:
     """
 
     levels: int
+    start_level: int
     variants: int
     scale: float
     seed: int
