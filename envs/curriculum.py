@@ -31,6 +31,7 @@ class Curriculum:
 
     Attributes:
         kind: Terrain type of each world, (N,).
+        is_flat: Worlds of the type that is flat, (N,) bool.
         level: Difficulty, (N, S).
     """
 
@@ -43,6 +44,8 @@ class Curriculum:
         edges = torch.tensor(library.proportions, device=device).cumsum(0)
         middle = (torch.arange(n, device=device) + 0.5) / n
         self.kind = torch.searchsorted(edges, middle.double()).clamp(max=len(library.types) - 1)
+        flat = library.types.index("flat") if "flat" in library.types else -1
+        self.is_flat = self.kind == flat
         drawn = torch.rand(n, num_skills, generator=random.generator, device=device)
         self.level = (drawn * (min(start_level, library.levels - 1) + 1)).long()
         self._way = torch.zeros(n, device=device)
@@ -90,7 +93,7 @@ class Curriculum:
 
     def _count(self, level: torch.Tensor, crossed: torch.Tensor, tried: torch.Tensor) -> None:
         """Add the rough episodes that ended to the shares of success at each level."""
-        rough = (self.kind != self._flat()).float()
+        rough = (~self.is_flat).float()
         self._tries = (MEMORY * self._tries).index_add(0, level, tried * rough)
         self._crossings = (MEMORY * self._crossings).index_add(0, level, crossed * rough)
 
@@ -108,14 +111,11 @@ class Curriculum:
         for index, name in enumerate(self._library.types):
             mine = (self.kind == index).float()
             log[f"Terrain/level_{name}"] = (level.mean(1) * mine).sum() / mine.sum().clamp(min=1)
-        rough = (self.kind != self._flat()).float()[:, None]
+        rough = (~self.is_flat).float()[:, None]
         by_skill = (level * rough).sum(0) / rough.sum().clamp(min=1)
         log |= {f"Terrain/level_{k}": v for k, v in zip(skills, by_skill, strict=True)}
         shares = (self._crossings / self._tries.clamp(min=1.0)).unbind()
         return log | {f"Terrain/success_level_{k}": share for k, share in enumerate(shares)}
-
-    def _flat(self) -> int:
-        return self._library.types.index("flat") if "flat" in self._library.types else -1
 
     def state_dict(self) -> dict[str, torch.Tensor]:
         """Return levels and the way of the running episodes."""

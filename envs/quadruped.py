@@ -109,6 +109,7 @@ class QuadrupedEnv(SkillEnv):
             self._curriculum = Curriculum(
                 self._library, len(self.skills), self._random, cfg.terrain.start_level
             )
+        self._is_flat = self._curriculum.is_flat if self._curriculum else self._all
         self._placed: torch.Tensor | None = None  # tiles chosen from outside, (N,)
 
     def _begin(self) -> None:
@@ -158,6 +159,7 @@ class QuadrupedEnv(SkillEnv):
             names.EXTRA_TIME_OUTS: time_outs,
             names.EXTRA_IMITATION: _unless(invalid, observer.imitation(view), observer.features),
             names.EXTRA_VALID: ~invalid,
+            names.EXTRA_FLAT: self._is_flat,
             names.NEXT_PROPRIO: _unless(invalid, observer.proprio(view), observer.clean),
             "log": self._log(terms, fallen, time_outs),
         }
