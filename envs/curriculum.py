@@ -27,17 +27,23 @@ class Curriculum:
 
     Attributes:
         kind: Terrain type of each world, (N,).
+        is_flat: Worlds of the type that is flat, (N,) bool.
         level: Difficulty, (N, S).
     """
 
-    def __init__(self, library: TerrainLibrary, num_skills: int, random: UniformBuffer) -> None:
-        """Deal the types to the worlds by their proportions; begin at the lowest level."""
+    def __init__(
+        self, library: TerrainLibrary, num_skills: int, random: UniformBuffer, start_level: int
+    ) -> None:
+        """Deal the types to the worlds by their proportions, and levels up to `start_level`."""
         self._library, self._random = library, random
         n, device = len(random["terrain"]), random["terrain"].device
         edges = torch.tensor(library.proportions, device=device).cumsum(0)
         middle = (torch.arange(n, device=device) + 0.5) / n
         self.kind = torch.searchsorted(edges, middle.double()).clamp(max=len(library.types) - 1)
-        self.level = torch.zeros(n, num_skills, dtype=torch.int64, device=device)
+        flat = library.types.index("flat") if "flat" in library.types else -1
+        self.is_flat = self.kind == flat
+        drawn = torch.rand(n, num_skills, generator=random.generator, device=device)
+        self.level = (drawn * (min(start_level, library.levels - 1) + 1)).long()
         self._way = torch.zeros(n, device=device)
         self._gone = torch.zeros(n, device=device)
         self._pure = torch.ones(n, dtype=torch.bool, device=device)
@@ -83,7 +89,7 @@ class Curriculum:
 
     def _count(self, level: torch.Tensor, crossed: torch.Tensor, tried: torch.Tensor) -> None:
         """Add the rough episodes that ended to the shares of success at each level."""
-        rough = (self.kind != self._flat()).float()
+        rough = (~self.is_flat).float()
         self._tries = (MEMORY * self._tries).index_add(0, level, tried * rough)
         self._crossings = (MEMORY * self._crossings).index_add(0, level, crossed * rough)
 
@@ -101,14 +107,11 @@ class Curriculum:
         for index, name in enumerate(self._library.types):
             mine = (self.kind == index).float()
             log[f"Terrain/level_{name}"] = (level.mean(1) * mine).sum() / mine.sum().clamp(min=1)
-        rough = (self.kind != self._flat()).float()[:, None]
+        rough = (~self.is_flat).float()[:, None]
         by_skill = (level * rough).sum(0) / rough.sum().clamp(min=1)
         log |= {f"Terrain/level_{k}": v for k, v in zip(skills, by_skill, strict=True)}
         shares = (self._crossings / self._tries.clamp(min=1.0)).unbind()
         return log | {f"Terrain/success_level_{k}": share for k, share in enumerate(shares)}
-
-    def _flat(self) -> int:
-        return self._library.types.index("flat") if "flat" in self._library.types else -1
 
     def state_dict(self) -> dict[str, torch.Tensor]:
         """Return levels and the way of the running episodes."""

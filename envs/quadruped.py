@@ -54,8 +54,8 @@ class QuadrupedEnv(SkillEnv):
         self.step_dt = sim_cfg.timestep * sim_cfg.substeps
         self.max_episode_length = round(cfg.terminations.episode_length / self.step_dt)
         self._library = build_library(cfg.terrain) if cfg.terrain else None
-        self._scene = _build_scene(robot, sim_cfg, cfg, self._library)
-        self.sim = _make_simulation(self._scene, sim_cfg, num_envs, backend, device)
+        self.scene = _build_scene(robot, sim_cfg, cfg, self._library)
+        self.sim = _make_simulation(self.scene, sim_cfg, num_envs, backend, device)
         self.keyframes = Keyframes.of(robot, device)
         self.keyframe_height, self.keyframe_pitch = self.keyframes.height, self.keyframes.pitch
         self._ground = None
@@ -85,8 +85,8 @@ class QuadrupedEnv(SkillEnv):
         self._last_joint_vel = torch.zeros(n, self.num_actions, device=device)
         self._last_joint_torque = torch.zeros(n, self.num_actions, device=device)
         self._measurements: Measurements | None = None
-        self._kinematics = FootKinematics(self._scene.model, robot, device)
-        self.robot = RobotState(self.sim, self._scene.sensors, self._kinematics, self._ground)
+        self._kinematics = FootKinematics(self.scene.model, robot, device)
+        self.robot = RobotState(self.sim, self.scene.sensors, self._kinematics, self._ground)
 
     def _build_terms(self, seed: int) -> None:
         cfg = self.cfg
@@ -104,10 +104,13 @@ class QuadrupedEnv(SkillEnv):
         self._tasks = TaskSampler(
             cfg.commands, cfg.skills, len(self.skills), self._random, self.device
         )
-        self._randomizer = Randomizer(cfg.randomization, self._scene, self.sim, self._random)
+        self._randomizer = Randomizer(cfg.randomization, self.scene, self.sim, self._random)
         self._curriculum = None
         if self._library:
-            self._curriculum = Curriculum(self._library, len(self.skills), self._random)
+            self._curriculum = Curriculum(
+                self._library, len(self.skills), self._random, cfg.terrain.start_level
+            )
+        self._is_flat = self._curriculum.is_flat if self._curriculum else self._all
         self._placed: torch.Tensor | None = None  # tiles chosen from outside, (N,)
 
     def _begin(self) -> None:
@@ -157,6 +160,7 @@ class QuadrupedEnv(SkillEnv):
             names.EXTRA_TIME_OUTS: time_outs,
             names.EXTRA_IMITATION: _unless(invalid, observer.imitation(view), observer.features),
             names.EXTRA_VALID: ~invalid,
+            names.EXTRA_FLAT: self._is_flat,
             names.NEXT_PROPRIO: _unless(invalid, observer.proprio(view), observer.clean),
             "log": self._log(terms, fallen, time_outs),
         }

@@ -49,6 +49,9 @@ EXTRA_IMITATION = "imitation"
 EXTRA_VALID = "imitation_valid"
 """Whether Phi before and after the step belong to one undisturbed motion, (N,) bool."""
 
+EXTRA_FLAT = "flat"
+"""Worlds whose ground is flat, (N,) bool."""
+
 
 @dataclass(frozen=True)
 class Measurements:

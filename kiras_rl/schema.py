@@ -98,6 +98,7 @@ class TerrainConfig:
     """
 
     levels: int
+    start_level: int
     variants: int
     scale: float
     seed: int
@@ -251,6 +252,7 @@ class FinetuningConfig:
 
     iterations: int
     residual_weight: float
+    flat_residual_weight: float
     sim: dict[str, Any]
     env: dict[str, Any]
     learner: dict[str, Any]

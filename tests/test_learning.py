@@ -10,9 +10,10 @@ from kiras_rl.config import load_config
 from kiras_rl.deploy.policy import OnboardPolicy
 from kiras_rl.envs import make_env
 from kiras_rl.export import export_policy
+from kiras_rl.phases import SKILL_LEARNING
 from kiras_rl.runner import KirasRunner
 from kiras_rl.tools.driver import Driver
-from kiras_rl.tools.evaluator import make_evaluator
+from kiras_rl.tools.evaluator import make_evaluators
 from kiras_rl.tools.script import Segment, record
 
 pytestmark = pytest.mark.slow
@@ -27,7 +28,8 @@ def trained(tmp_path_factory):
     overrides = [*schedule, "device=cpu", "learner.estimator.adaboot=off"]
     config = load_config("solo8_quick", overrides)
     run = tmp_path_factory.mktemp("run")
-    runner = KirasRunner(make_env(config), config, run, "cpu", make_evaluator(config, "cpu"))
+    evaluators = make_evaluators(config, SKILL_LEARNING, "cpu")
+    runner = KirasRunner(make_env(config), config, run, "cpu", evaluators)
     log = []
     runner.learn(ITERATIONS, on_iteration=lambda status: log.append(status.scalars))
     return run, log, runner.evaluation

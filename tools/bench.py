@@ -35,6 +35,8 @@ took turns, and the median over the rounds.
 physics    steps a second of the environment, against mujoco.batch alone on the same model, states
            and targets; target: at least 80 % of its speed. Then the parts of an environment step.
            Always the native backend on the CPU.
+terrain    the same on the terrain with which finetuning begins: against mujoco.batch alone on it,
+           target 75 % of its speed, and against flat ground, target at most 2.5 times as long
 learning   seconds of an iteration of KiRAS, against stock rsl-rl PPO with the same networks, epochs
            and mini-batches on the same environment; target: at most 1.3 times as long. Stock runs
            twice, the second time with the rollout on one thread, as KiRAS has it; the faster one
@@ -55,6 +57,8 @@ examples:
 """
 
 SPEED_TARGET = 0.8  # of bare mujoco.batch
+TERRAIN_SPEED_TARGET = 0.75  # of bare mujoco.batch on the same terrain
+TERRAIN_COST_TARGET = 2.5  # times a step on flat ground
 PRICE_TARGET = 1.3  # iterations of stock rsl-rl PPO
 BUSY = 0.5  # mean number of running programs in the last minute
 
@@ -203,6 +207,34 @@ def _parts_of_a_step(measured: environment.EnvironmentTimes) -> Table:
     return table
 
 
+def _terrain(config: Config, rounds: int) -> tuple[Figures, list[Table]]:
+    steps = environment.measure_terrain(config, rounds)
+    share = summarise(ratios(steps, environment.BARE_TERRAIN, environment.TERRAIN))
+    cost = summarise(ratios(steps, environment.TERRAIN, environment.ENVIRONMENT))
+    columns = ("ms", "env steps/s", "of bare speed", "times flat ground")
+    table = _table(f"control steps of {config.num_envs} worlds", *columns)
+    for name, times in steps.items():
+        row = [f"{1e3 * median(times):.2f}", f"{config.num_envs / median(times):,.0f}"]
+        if name == environment.TERRAIN:
+            row += ["{} ({})".format(*_with_range(figure)) for figure in (share, cost)]
+        table.add_row(name, *row)
+    fast, cheap = share["median"] >= TERRAIN_SPEED_TARGET, cost["median"] <= TERRAIN_COST_TARGET
+    table.caption = "\n".join(
+        (
+            _verdict(fast, f"target: at least {TERRAIN_SPEED_TARGET} of bare speed"),
+            _verdict(cheap, f"target: at most {TERRAIN_COST_TARGET} times flat ground"),
+        )
+    )
+    figures: Figures = {
+        "seconds_per_step": {name: summarise(times) for name, times in steps.items()},
+        "share_of_bare_speed": share,
+        "times_flat": cost,
+        "targets": [TERRAIN_SPEED_TARGET, TERRAIN_COST_TARGET],
+        "rounds": steps,
+    }
+    return figures, [table]
+
+
 def _learning(config: Config, rounds: int) -> tuple[Figures, list[Table]]:
     measured = learning.measure_learning(config, rounds, resolve_device(config.device))
     times, updates = measured.iterations, measured.updates
@@ -255,7 +287,12 @@ def _inference(config: Config, rounds: int) -> tuple[Figures, list[Table]]:
 
 Part = Callable[[Config, int], tuple[Figures, list[Table]]]
 
-PARTS: dict[str, Part] = {"physics": _physics, "learning": _learning, "inference": _inference}
+PARTS: dict[str, Part] = {
+    "physics": _physics,
+    "terrain": _terrain,
+    "learning": _learning,
+    "inference": _inference,
+}
 
 
 # --- tables -------------------------------------------------------------------------------------

@@ -11,15 +11,18 @@ import mujoco
 import torch
 from mujoco.batch import Batch
 
+from kiras_rl.config import ConfigError
 from kiras_rl.envs import make_env
 from kiras_rl.envs.quadruped import QuadrupedEnv
 from kiras_rl.envs.simulation.base import RANDOMISED_FIELDS
+from kiras_rl.phases import FINETUNING, SKILL_LEARNING, phase_config
 from kiras_rl.runner import single_threaded
 from kiras_rl.schema import Config, SimConfig
 from kiras_rl.tools.timing import PartTimer, Times, interleave
 
 BARE, NO_SENSORS = "mujoco.batch", "batch without sensors"
 SIMULATION, ENVIRONMENT = "NativeSimulation.step", "environment step"
+BARE_TERRAIN, TERRAIN = "mujoco.batch on terrain", "environment step on terrain"
 
 ACTION_NOISE = 0.3  # as early in training, around the keyframe's pose: most robots stay up
 WARM_UP = 50  # control steps after the first reset, until the robots stand
@@ -85,6 +88,10 @@ class Workload:
         batch = Batch(model, env.num_envs, self._sim.threads)
         for name in RANDOMISED_FIELDS:
             batch.expand(name)[:] = sim[f"field/{name}"].numpy()
+        if terrain := env.scene.terrain:
+            tile = self.state["tile"].numpy()
+            for name, values in terrain.fields.items():
+                batch.expand(name)[:, terrain.geoms] = values[tile]
         batch.set_const()
         ctrl, substeps = batch.bind("ctrl"), self._sim.substeps
         targets = [target.numpy() for target in self.targets]
@@ -145,6 +152,31 @@ def measure_environment(config: Config, rounds: int) -> EnvironmentTimes:
         }
         steps = interleave(variants, rounds)
         return EnvironmentTimes(steps, _measure_parts(work, rounds), _share_of_resets(work))
+
+
+def measure_terrain(config: Config, rounds: int) -> Times:
+    """Time the environment of finetuning, its physics alone, and the one on flat ground.
+
+    The worlds show the tiles with which finetuning begins. Native backend, one thread of torch.
+
+    Raises:
+        ConfigError: No finetuning, or as `make_env`.
+        RobotError: As `make_env`.
+    """
+    if config.finetuning is None:
+        raise ConfigError("finetuning=null: this configuration has no terrain to measure")
+    config = replace(config, sim=replace(config.sim, backend="native"))
+    with single_threaded("cpu"):
+        flat, rough = (
+            Workload(make_env(alone), alone.sim, alone.learner.ppo.num_steps, alone.seed)
+            for alone in (phase_config(config, phase) for phase in (SKILL_LEARNING, FINETUNING))
+        )
+        variants = {
+            ENVIRONMENT: flat.environment(),
+            BARE_TERRAIN: rough.bare(sensors=True),
+            TERRAIN: rough.environment(),
+        }
+        return interleave(variants, rounds)
 
 
 def _measure_parts(work: Workload, rounds: int) -> Times:

@@ -67,6 +67,9 @@ class Progress:
             parts.append(f"D {expert:+.2f}/{policy:+.2f}")
         if status.evaluation:
             parts.append("h [cm], pitch, v: " + " ".join(map(_brief, status.evaluation.values())))
+        if status.terrain:
+            shares = zip(status.terrain.terrains, status.terrain.strict.mean(dim=1), strict=True)
+            parts.append("crossed [%]: " + " ".join(f"{k} {100 * v:.0f}" for k, v in shares))
         return " | ".join(parts)
 
 

@@ -129,7 +129,8 @@ class KirasPPO(PPO):
         """Return task and imitation rewards, (N, G); summed where there is one critic."""
         task = rewards
         if self.reference:
-            task = task + self.reference.reward(before, self.transition.distribution_params[0])
+            mean_action = self.transition.distribution_params[0]
+            task = task + self.reference.reward(before, mean_action, extras[names.EXTRA_FLAT])
         task = task.clamp(min=0.0) if self.config.ppo.only_positive_rewards else task
         if self.imitation is None:
             return task.unsqueeze(1)
@@ -277,8 +278,8 @@ class KirasPPO(PPO):
             obs: A first observation; gains the groups that the learner itself writes.
             env: The environment.
             cfg: rsl-rl's dictionary; `learner` holds the LearnerConfig, `iterations` is the length
-                of the phase, `residual_weight` that of the residual reward a step, None in a phase
-                without a reference.
+                of the phase, `residual_weights` those of the residual reward a step, on rough and
+                on flat ground, None in a phase without a reference.
             device: Where networks and storage live.
         """
         config: LearnerConfig = cfg["learner"]
@@ -300,10 +301,10 @@ class KirasPPO(PPO):
             SkillSampler(config.skill_init, len(env.skills), device) if config.skill_init else None
         )
         actor = _build_actor(obs, groups, env.num_actions, config).to(device)
-        residual_weight, reference = cfg["residual_weight"], None
-        if residual_weight is not None:
+        weights, reference = cfg["residual_weights"], None
+        if weights is not None:
             policy = ExportedPolicy(estimation.estimator if estimation else None, actor.mlp)
-            reference = Reference(policy, residual_weight)
+            reference = Reference(policy, *weights)
         return KirasPPO(
             actor=actor,
             critic=GroupCritic(obs, groups, 2 if has_two else 1, list(ppo.critic_dims)).to(device),

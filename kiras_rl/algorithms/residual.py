@@ -16,32 +16,37 @@ class Reference:
 
     r_res = -|mu - mu_flat|, the distance between the mean actions that policy and reference choose
     for the same observation. Means, because the distance of sampled actions would mostly measure
-    the action noise.
+    the action noise. On flat ground, where the reference is right, it weighs more: there the
+    policy is to remember, elsewhere to learn.
     """
 
-    def __init__(self, policy: ExportedPolicy, weight: float) -> None:
+    def __init__(self, policy: ExportedPolicy, weight: float, flat_weight: float) -> None:
         """Copy the policy.
 
         Args:
             policy: Estimator and actor; what becomes of them later does not matter.
             weight: Of the reward, a step.
+            flat_weight: The same in worlds whose ground is flat.
         """
         self.policy = copy.deepcopy(policy).requires_grad_(False)
-        self._weight = weight
+        self._weight, self._flat_weight = weight, flat_weight
         self._distance: list[torch.Tensor] = []
 
     @torch.no_grad()
-    def reward(self, obs: TensorDict, mean_action: torch.Tensor) -> torch.Tensor:
+    def reward(
+        self, obs: TensorDict, mean_action: torch.Tensor, is_flat: torch.Tensor
+    ) -> torch.Tensor:
         """Return the weighted reward of a step, (N,).
 
         Args:
             obs: What the actor saw.
             mean_action: What it chose, without noise, (N, J).
+            is_flat: Worlds whose ground is flat, (N,) bool.
         """
         flat, _ = self.policy(obs[names.PROPRIO], obs[names.HISTORY])
         distance = torch.linalg.vector_norm(mean_action - flat, dim=-1)
         self._distance.append(distance.mean())
-        return -self._weight * distance
+        return -torch.where(is_flat, self._flat_weight, self._weight) * distance
 
     def mean_distance(self) -> float:
         """Return the mean distance since the last call."""

@@ -74,6 +74,7 @@ class CountingEnv(SkillEnv):
             names.EXTRA_TIME_OUTS: ends & ~self.falls,
             names.EXTRA_IMITATION: self.features(),
             names.EXTRA_VALID: torch.ones(self.num_envs, dtype=torch.bool),
+            names.EXTRA_FLAT: torch.zeros(self.num_envs, dtype=torch.bool),
             names.NEXT_PROPRIO: torch.randn(self.num_envs, 4),
             "log": {"Perf/physics_time": torch.tensor(0.0)},
         }

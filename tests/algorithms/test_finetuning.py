@@ -67,9 +67,12 @@ def test_the_residual_reward_is_the_distance_of_the_mean_actions(make_runner):
     alg = make_runner().alg
     obs = alg.storage.observations[0]
     mean = alg.policy()(obs["proprio"], obs["history"])[0]
-    reference = Reference(alg.policy(), weight=0.15)
+    reference = Reference(alg.policy(), weight=0.15, flat_weight=1.0)
     away = mean + torch.tensor([0.3, -0.4])  # 0.5 from the reference
-    assert torch.allclose(reference.reward(obs, away), torch.tensor(-0.15 * 0.5), atol=1e-6)
+    is_flat = torch.arange(len(mean)) % 2 == 0
+    reward = reference.reward(obs, away, is_flat)
+    assert torch.allclose(reward[::2], torch.tensor(-0.5), atol=1e-6)
+    assert torch.allclose(reward[1::2], torch.tensor(-0.15 * 0.5), atol=1e-6)
 
 
 def test_the_clock_counts_over_both_phases(begin):

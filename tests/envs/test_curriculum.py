@@ -27,7 +27,7 @@ def library():
 @pytest.fixture
 def curriculum(library):
     random = UniformBuffer(WORLDS, COLUMNS, torch.Generator().manual_seed(0))
-    return Curriculum(library, SKILLS, random)
+    return Curriculum(library, SKILLS, random, start_level=0)
 
 
 def flags(*worlds):
@@ -52,6 +52,13 @@ def walk(curriculum, seconds, command, velocity):
 def test_types_are_dealt_by_their_proportions(curriculum, library):
     names = [library.types[k] for k in curriculum.kind.tolist()]
     assert names == ["flat", *2 * ["slopes"], *2 * ["bars"], *2 * ["footholds"], *3 * ["stairs"]]
+
+
+def test_the_first_levels_are_drawn_up_to_the_start_level(library):
+    random = UniformBuffer(200, COLUMNS, torch.Generator().manual_seed(0))
+    level = Curriculum(library, SKILLS, random, start_level=1).level
+    assert level.unique().tolist() == [0, 1]
+    assert level.float().mean(dim=0).tolist() == pytest.approx([0.5] * SKILLS, abs=0.1)
 
 
 def test_crossing_promotes_the_skill_that_did_it(curriculum):
@@ -134,7 +141,7 @@ def test_a_saved_curriculum_goes_on(curriculum, library):
     walk(curriculum, 3, (0.3, 0.0, 0.0), (0.1, 0.0, 0.0))
     curriculum.update(flags(1), flags(), flags(1), skills())
     random = UniformBuffer(WORLDS, COLUMNS, torch.Generator().manual_seed(1))
-    other = Curriculum(library, SKILLS, random)
+    other = Curriculum(library, SKILLS, random, start_level=2)
     other.load_state_dict(curriculum.state_dict())
     for name, value in curriculum.state_dict().items():
         assert torch.equal(other.state_dict()[name], value), name

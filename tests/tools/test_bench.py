@@ -56,6 +56,21 @@ def test_the_parts_of_an_environment_step_are_named_and_timed(bench):
         assert parts[part] > 0.0
 
 
+def test_terrain_is_measured_against_the_batch_on_it_and_against_flat_ground(bench):
+    report, out = bench("--parts=terrain", "finetuning.env.terrain.levels=2")
+    seconds = report["terrain"]["seconds_per_step"]
+    flat, bare, rough = (
+        seconds[name]["median"]
+        for name in (
+            "environment step", "mujoco.batch on terrain", "environment step on terrain"
+        )
+    )  # fmt: skip
+    assert report["terrain"]["share_of_bare_speed"]["median"] == pytest.approx(bare / rough)
+    assert report["terrain"]["times_flat"]["median"] == pytest.approx(rough / flat)
+    assert "target: at least 0.75" in out
+    assert "target: at most 2.5" in out
+
+
 def test_every_part_of_the_learner_has_a_price(bench):
     report, out = bench("--parts=learning")
     learning = report["learning"]
