@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
@@ -148,8 +149,13 @@ def ground_height(model: mujoco.MjModel, data: mujoco.MjData, place: np.ndarray)
 def _own_terrain(saved: object) -> TerrainConfig | None:
     if not isinstance(saved, Mapping) or not saved.get("finetuning"):
         return None
+    return _read(json.dumps(saved))
+
+
+@cache  # it takes half a second, and every checkpoint of a run that is followed asks for it
+def _read(saved: str) -> TerrainConfig | None:
     try:
-        return _terrain(config_from_dict(dict(saved)))
+        return _terrain(config_from_dict(json.loads(saved)))
     except ConfigError:
         return None
 
