@@ -19,6 +19,7 @@ import torch
 from kiras_rl.config import list_configs, load_config
 from kiras_rl.envs import rewards
 from kiras_rl.envs.state import Step
+from kiras_rl.phases import FINETUNING, phase_config
 from kiras_rl.robots.robot import load_robot
 from kiras_rl.tools.curves import read_scalars
 from kiras_rl.tools.train import main as train
@@ -162,13 +163,19 @@ def test_every_shipped_configuration_is_described():
     assert [name for name in list_configs() if f"| `{name}` |" not in text] == []
 
 
-def test_the_example_configuration_loads(tmp_path):
-    (example,) = blocks(TEXTS[ROOT / "docs" / "configuration.md"], "yaml")
-    path = tmp_path / "mine.yaml"
-    path.write_text(example)
-    config = load_config(str(path))
-    assert config.env.rewards.terms["lin_vel_y"] is None
-    assert config.learner.skill_init is None
+def test_the_example_configurations_load(tmp_path):
+    examples = blocks(TEXTS[ROOT / "docs" / "configuration.md"], "yaml")
+    configs = {}
+    for example in examples:
+        path = tmp_path / re.match(r"# (\w+\.yaml)", example)[1]
+        path.write_text(example)
+        configs[path.stem] = load_config(str(path))
+    mine, steeper = configs.pop("mine"), configs.pop("steeper")
+    assert not configs
+    assert mine.env.rewards.terms["lin_vel_y"] is None
+    assert mine.learner.skill_init is None
+    assert phase_config(steeper, FINETUNING).env.terrain.scale == 1.5
+    assert phase_config(steeper, FINETUNING).iterations == 4000
 
 
 @pytest.fixture(scope="module")
@@ -181,7 +188,13 @@ def tags(tmp_path_factory) -> set[str]:
     torch.set_num_threads(threads)
     (run,) = folder.glob("smoke/*")
     skills = "|".join(sorted(load_robot("solo8").skills, key=len, reverse=True))
-    patterns = ((rf"_({skills})(?=/|$)", "_<skill>"), (r"^Reward/.*", "Reward/<term>"))
+    types = "|".join(phase_config(load_config("smoke"), FINETUNING).env.terrain.types)
+    patterns = (
+        (rf"_({skills})(?=/|$)", "_<skill>"),
+        (rf"_({types})$", "_<type>"),
+        (r"_level_\d+$", "_level_<k>"),
+        (r"^Reward/.*", "Reward/<term>"),
+    )
     found = set()
     for tag in read_scalars(run):
         for pattern, name in patterns:

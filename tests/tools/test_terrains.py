@@ -54,7 +54,7 @@ def test_without_opengl_one_line_names_the_package(monkeypatch, capsys):
             ["solo8", "finetuning.env.terrain.cell=0.3"],
             "a tile of 8 m has to be a whole number of cells",
         ),
-        (["solo8", "finetuning.env.terrain.levls=3"], "did you mean 'env.terrain.levels'?"),
+        (["solo8", "finetuning.env.terrain.levls=3"], "env.terrain.levls: Key 'levls' not in"),
     ],
 )
 def test_what_cannot_be_is_one_line(arguments, message, capsys):
