@@ -129,8 +129,10 @@ class KirasPPO(PPO):
         """Return task and imitation rewards, (N, G); summed where there is one critic."""
         task = rewards
         if self.reference:
-            mean_action = self.transition.distribution_params[0]
-            task = task + self.reference.reward(before, mean_action, extras[names.EXTRA_FLAT])
+            step = self.transition
+            task = task + self.reference.reward(
+                before, step.actions, step.distribution_params[0], extras[names.EXTRA_FLAT]
+            )
         task = task.clamp(min=0.0) if self.config.ppo.only_positive_rewards else task
         if self.imitation is None:
             return task.unsqueeze(1)

@@ -14,10 +14,11 @@ from kiras_rl.models.exported import ExportedPolicy
 class Reference:
     """The policy of skill learning, frozen with its own estimator.
 
-    r_res = -|mu - mu_flat|, the distance between the mean actions that policy and reference choose
-    for the same observation. Means, because the distance of sampled actions would mostly measure
-    the action noise. On flat ground, where the reference is right, it weighs more: there the
-    policy is to remember, elsewhere to learn.
+    r_res = -|a - a_flat|, the distance between the action that was taken and the one that the
+    reference chooses for the same observation. Taken, with its noise: the distance of the mean
+    action is the same whatever the noise was, and so teaches a policy gradient nothing about it. On
+    flat ground, where the reference is right, it weighs more: there the policy is to remember,
+    elsewhere to learn.
     """
 
     def __init__(self, policy: ExportedPolicy, weight: float, flat_weight: float) -> None:
@@ -34,22 +35,27 @@ class Reference:
 
     @torch.no_grad()
     def reward(
-        self, obs: TensorDict, mean_action: torch.Tensor, is_flat: torch.Tensor
+        self,
+        obs: TensorDict,
+        action: torch.Tensor,
+        mean_action: torch.Tensor,
+        is_flat: torch.Tensor,
     ) -> torch.Tensor:
         """Return the weighted reward of a step, (N,).
 
         Args:
             obs: What the actor saw.
-            mean_action: What it chose, without noise, (N, J).
+            action: What was done, (N, J).
+            mean_action: The same without noise, for the log, (N, J).
             is_flat: Worlds whose ground is flat, (N,) bool.
         """
         flat, _ = self.policy(obs[names.PROPRIO], obs[names.HISTORY])
-        distance = torch.linalg.vector_norm(mean_action - flat, dim=-1)
-        self._distance.append(distance.mean())
+        self._distance.append(torch.linalg.vector_norm(mean_action - flat, dim=-1).mean())
+        distance = torch.linalg.vector_norm(action - flat, dim=-1)
         return -torch.where(is_flat, self._flat_weight, self._weight) * distance
 
     def mean_distance(self) -> float:
-        """Return the mean distance since the last call."""
+        """Return the mean distance of the actions without noise since the last call."""
         mean = torch.stack(self._distance).mean().item()
         self._distance.clear()
         return mean

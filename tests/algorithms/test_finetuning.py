@@ -63,16 +63,17 @@ def test_the_reference_stays_while_the_policy_moves(begin):
     assert scalars[1]["Residual/distance"] > 1e-4
 
 
-def test_the_residual_reward_is_the_distance_of_the_mean_actions(make_runner):
+def test_the_residual_reward_is_the_distance_of_what_was_done(make_runner):
     alg = make_runner().alg
     obs = alg.storage.observations[0]
     mean = alg.policy()(obs["proprio"], obs["history"])[0]
     reference = Reference(alg.policy(), weight=0.15, flat_weight=1.0)
     away = mean + torch.tensor([0.3, -0.4])  # 0.5 from the reference
     is_flat = torch.arange(len(mean)) % 2 == 0
-    reward = reference.reward(obs, away, is_flat)
+    reward = reference.reward(obs, away, mean, is_flat)
     assert torch.allclose(reward[::2], torch.tensor(-0.5), atol=1e-6)
     assert torch.allclose(reward[1::2], torch.tensor(-0.15 * 0.5), atol=1e-6)
+    assert reference.mean_distance() == pytest.approx(0.0, abs=1e-6)  # of the mean action
 
 
 def test_the_clock_counts_over_both_phases(begin):
