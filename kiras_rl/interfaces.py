@@ -37,6 +37,12 @@ COMMAND = "command"
 CONTEXT = "context"
 """Output of the context estimator; written by the learner, never by the environment."""
 
+FLAT_ACTION = "flat_action"
+"""Action of the frozen flat policy, (N, J); written by the learner in finetuning."""
+
+IS_FLAT = "is_flat"
+"""Worlds whose ground is flat, (N, 1) bool; moved here from extras by the learner."""
+
 NEXT_PROPRIO = "next_proprio"
 """Noise-free `proprio` after the step and before a reset, (N, P); extras, then storage."""
 
@@ -49,7 +55,7 @@ EXTRA_IMITATION = "imitation"
 EXTRA_VALID = "imitation_valid"
 """Whether Phi before and after the step belong to one undisturbed motion, (N,) bool."""
 
-EXTRA_FLAT = "flat"
+EXTRA_FLAT = "is_flat"
 """Worlds whose ground is flat, (N,) bool."""
 
 

@@ -411,16 +411,13 @@ class single_threaded:  # noqa: N801  (used like a function)
 
 def _rsl_rl_config(config: Config, phase: str, step_dt: float) -> dict:
     alone = phase_config(config, phase)
-    residual_weights = None
-    if phase == FINETUNING and config.finetuning:
-        scale = step_dt if config.env.rewards.scale_by_dt else 1.0
-        settings = config.finetuning
-        residual_weights = (scale * settings.residual_weight, scale * settings.flat_residual_weight)
+    finetuning = config.finetuning if phase == FINETUNING else None
     return {
         "algorithm": {"class_name": "kiras_rl.algorithms.kiras.KirasPPO"},
         "learner": alone.learner,
         "iterations": alone.iterations,
-        "residual_weights": residual_weights,
+        "retention": finetuning.retention if finetuning else None,
+        "reward_scale": step_dt if config.env.rewards.scale_by_dt else 1.0,
         "num_steps_per_env": alone.learner.ppo.num_steps,
         "save_interval": 0,
     }

@@ -247,12 +247,19 @@ class EvaluationConfig:
 
 
 @dataclass
+class RetentionConfig:
+    """What holds the policy near that of skill learning."""
+
+    residual_weight: float
+    flat_loss_weight: float
+
+
+@dataclass
 class FinetuningConfig:
     """Terrain finetuning, the second phase; sim, env and learner hold what changes there."""
 
     iterations: int
-    residual_weight: float
-    flat_residual_weight: float
+    retention: RetentionConfig
     sim: dict[str, Any]
     env: dict[str, Any]
     learner: dict[str, Any]

@@ -129,10 +129,8 @@ class KirasPPO(PPO):
         """Return task and imitation rewards, (N, G); summed where there is one critic."""
         task = rewards
         if self.reference:
-            step = self.transition
-            task = task + self.reference.reward(
-                before, step.actions, step.distribution_params[0], extras[names.EXTRA_FLAT]
-            )
+            is_flat = extras[names.EXTRA_FLAT]
+            task = task + self.reference.record(before, self.transition.actions, is_flat)
         task = task.clamp(min=0.0) if self.config.ppo.only_positive_rewards else task
         if self.imitation is None:
             return task.unsqueeze(1)
@@ -170,8 +168,6 @@ class KirasPPO(PPO):
             scalars |= self.estimation.update(self.storage, self.num_mini_batches)
         if self.imitation:
             scalars |= self.imitation.update(self.storage, self.iteration, self.progress)
-        if self.reference:
-            scalars["Residual/distance"] = self.reference.mean_distance()
         self.storage.clear()
         self.iteration += 1
         self._apply_schedules()
@@ -180,16 +176,19 @@ class KirasPPO(PPO):
     def _update_policy(self) -> dict[str, float]:
         st = self.storage
         mean, std = st.distribution_params
-        data = st.shuffled(
-            actor_obs=self.actor.get_latent(st.observations),
-            critic_obs=st.observations[names.CRITIC],
-            actions=st.actions,
-            old_log_prob=st.actions_log_prob,
-            advantages=st.advantages,
-            returns=st.returns,
-            mean=mean,
-            std=std,
-        )
+        tensors = {
+            "actor_obs": self.actor.get_latent(st.observations),
+            "critic_obs": st.observations[names.CRITIC],
+            "actions": st.actions,
+            "old_log_prob": st.actions_log_prob,
+            "advantages": st.advantages,
+            "returns": st.returns,
+            "mean": mean,
+            "std": std,
+        }
+        if self.reference:
+            tensors |= {key: st.observations[key] for key in (names.FLAT_ACTION, names.IS_FLAT)}
+        data = st.shuffled(**tensors)
         totals = torch.zeros(3, device=self.device)
         for batch in mini_batches(data, self.num_mini_batches, self.num_learning_epochs):
             totals += self._policy_step(batch)
@@ -217,6 +216,10 @@ class KirasPPO(PPO):
         )  # fmt: skip
         value = losses.value_loss(values, batch["returns"])
         loss = surrogate + self.value_loss_coef * value
+        if self.reference:
+            loss = loss + self.reference.loss_weight * losses.retention_loss(
+                distribution.mean, batch[names.FLAT_ACTION], batch[names.IS_FLAT].squeeze(1)
+            )
         self.optimizer.zero_grad()
         loss.backward()
         for network in (self.actor, *self.critic.critics):
@@ -268,7 +271,19 @@ class KirasPPO(PPO):
             scalars[f"Critic/{group}_reward"] = st.rewards[..., g].mean().item()
             scalars[f"Critic/{group}_return"] = st.returns[..., g].mean().item()
             scalars[f"Critic/{group}_value"] = st.values[..., g].mean().item()
-        return scalars
+        return scalars | (self._describe_retention() if self.reference else {})
+
+    def _describe_retention(self) -> dict[str, float]:
+        """Return how far the mean actions are from those of the flat policy."""
+        st = self.storage
+        flat, is_flat = (st.observations[key] for key in (names.FLAT_ACTION, names.IS_FLAT))
+        distance = torch.linalg.vector_norm(st.distribution_params[0] - flat, dim=-1)
+        weight = is_flat.squeeze(-1).float()
+        on_flat = (distance * weight).sum() / weight.sum().clamp(min=1.0)
+        return {
+            "Residual/distance": distance.mean().item(),
+            "Residual/distance_flat": on_flat.item(),
+        }
 
     # --- construction, modes, state -------------------------------------------------------------
 
@@ -280,8 +295,8 @@ class KirasPPO(PPO):
             obs: A first observation; gains the groups that the learner itself writes.
             env: The environment.
             cfg: rsl-rl's dictionary; `learner` holds the LearnerConfig, `iterations` is the length
-                of the phase, `residual_weights` those of the residual reward a step, on rough and
-                on flat ground, None in a phase without a reference.
+                of the phase, `retention` holds its RetentionConfig, None in a phase without a
+                reference, `reward_scale` the factor of all rewards of a step.
             device: Where networks and storage live.
         """
         config: LearnerConfig = cfg["learner"]
@@ -290,6 +305,9 @@ class KirasPPO(PPO):
         if estimation:
             obs[names.CONTEXT] = estimation.context(obs)
         obs[names.NEXT_PROPRIO] = torch.zeros_like(obs[names.PROPRIO])
+        if cfg["retention"] is not None:
+            obs[names.FLAT_ACTION] = torch.zeros(len(obs), env.num_actions, device=device)
+            obs[names.IS_FLAT] = torch.zeros(len(obs), 1, dtype=torch.bool, device=device)
         imitation = SelfImitation.build(config.imitation, obs, env, ppo.num_steps, device)
         groups = {
             "actor": [names.PROPRIO, names.CONTEXT if estimation else names.HISTORY],
@@ -303,10 +321,10 @@ class KirasPPO(PPO):
             SkillSampler(config.skill_init, len(env.skills), device) if config.skill_init else None
         )
         actor = _build_actor(obs, groups, env.num_actions, config).to(device)
-        weights, reference = cfg["residual_weights"], None
-        if weights is not None:
+        retention, reference = cfg["retention"], None
+        if retention is not None:
             policy = ExportedPolicy(estimation.estimator if estimation else None, actor.mlp)
-            reference = Reference(policy, *weights)
+            reference = Reference(policy, retention, cfg["reward_scale"])
         return KirasPPO(
             actor=actor,
             critic=GroupCritic(obs, groups, 2 if has_two else 1, list(ppo.critic_dims)).to(device),

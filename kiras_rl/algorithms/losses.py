@@ -24,6 +24,21 @@ def value_loss(values: torch.Tensor, returns: torch.Tensor) -> torch.Tensor:
     return (values - returns).square().mean(dim=0).sum()
 
 
+def retention_loss(
+    mean: torch.Tensor, flat_action: torch.Tensor, is_flat: torch.Tensor
+) -> torch.Tensor:
+    """Return E |mu - a_flat|^2 over the steps on flat ground; 0 where there are none.
+
+    Args:
+        mean: Mean actions, (B, J).
+        flat_action: Actions of the frozen flat policy, (B, J).
+        is_flat: Steps on flat ground, (B,) bool.
+    """
+    weight = is_flat.float()
+    squared = (mean - flat_action).square().sum(-1)
+    return (squared * weight).sum() / weight.sum().clamp(min=1.0)
+
+
 def adapt_learning_rate(
     rate: float, kl: float, desired_kl: float, limits: tuple[float, float]
 ) -> float:

@@ -1,4 +1,4 @@
-"""The residual reward of terrain finetuning: do not leave what skill learning found."""
+"""What holds terrain finetuning near what skill learning found."""
 
 from __future__ import annotations
 
@@ -9,56 +9,45 @@ from tensordict import TensorDict
 
 from kiras_rl import interfaces as names
 from kiras_rl.models.exported import ExportedPolicy
+from kiras_rl.schema import RetentionConfig
 
 
 class Reference:
     """The policy of skill learning, frozen with its own estimator.
 
-    r_res = -|a - a_flat|, the distance between the action that was taken and the one that the
-    reference chooses for the same observation. Taken, with its noise: the distance of the mean
-    action is the same whatever the noise was, and so teaches a policy gradient nothing about it. On
-    flat ground, where the reference is right, it weighs more: there the policy is to remember,
-    elsewhere to learn.
+    It holds the policy in two ways. Everywhere by the paper's residual reward, r_res =
+    -|a - a_flat|, of the action that was taken: the distance of mean actions does not depend on
+    the noise, so a policy gradient could not follow it. And on flat ground, where the reference is
+    right, by a loss on the mean action, whose gradient is exact: within a few thousand iterations
+    the reward alone is lost among the noise of the returns, and postures sink.
     """
 
-    def __init__(self, policy: ExportedPolicy, weight: float, flat_weight: float) -> None:
+    def __init__(
+        self, policy: ExportedPolicy, config: RetentionConfig, reward_scale: float
+    ) -> None:
         """Copy the policy.
 
         Args:
             policy: Estimator and actor; what becomes of them later does not matter.
-            weight: Of the reward, a step.
-            flat_weight: The same in worlds whose ground is flat.
+            config: Weights of reward and loss.
+            reward_scale: Factor of the reward's weight, as all rewards of a step have it.
         """
         self.policy = copy.deepcopy(policy).requires_grad_(False)
-        self._weight, self._flat_weight = weight, flat_weight
-        self._distance: list[torch.Tensor] = []
+        self.loss_weight = config.flat_loss_weight
+        self._reward_weight = config.residual_weight * reward_scale
 
     @torch.no_grad()
-    def reward(
-        self,
-        obs: TensorDict,
-        action: torch.Tensor,
-        mean_action: torch.Tensor,
-        is_flat: torch.Tensor,
-    ) -> torch.Tensor:
-        """Return the weighted reward of a step, (N,).
+    def record(self, obs: TensorDict, action: torch.Tensor, is_flat: torch.Tensor) -> torch.Tensor:
+        """Write what the loss needs into `obs`; return the residual reward of a step, (N,).
 
         Args:
             obs: What the actor saw.
             action: What was done, (N, J).
-            mean_action: The same without noise, for the log, (N, J).
             is_flat: Worlds whose ground is flat, (N,) bool.
         """
         flat, _ = self.policy(obs[names.PROPRIO], obs[names.HISTORY])
-        self._distance.append(torch.linalg.vector_norm(mean_action - flat, dim=-1).mean())
-        distance = torch.linalg.vector_norm(action - flat, dim=-1)
-        return -torch.where(is_flat, self._flat_weight, self._weight) * distance
-
-    def mean_distance(self) -> float:
-        """Return the mean distance of the actions without noise since the last call."""
-        mean = torch.stack(self._distance).mean().item()
-        self._distance.clear()
-        return mean
+        obs[names.FLAT_ACTION], obs[names.IS_FLAT] = flat, is_flat.unsqueeze(1)
+        return -self._reward_weight * torch.linalg.vector_norm(action - flat, dim=-1)
 
     def state_dict(self) -> dict:
         """Return the frozen weights."""

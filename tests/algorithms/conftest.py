@@ -43,6 +43,7 @@ class CountingEnv(SkillEnv):
         self.episode_length_buf = torch.zeros(num_envs, dtype=torch.int64)
         self.skill = torch.arange(num_envs) % 2
         self.falls = torch.arange(num_envs) % 3 == 0
+        self.is_flat = torch.zeros(num_envs, dtype=torch.bool)
         self.observe()
 
     def features(self):
@@ -74,7 +75,7 @@ class CountingEnv(SkillEnv):
             names.EXTRA_TIME_OUTS: ends & ~self.falls,
             names.EXTRA_IMITATION: self.features(),
             names.EXTRA_VALID: torch.ones(self.num_envs, dtype=torch.bool),
-            names.EXTRA_FLAT: torch.zeros(self.num_envs, dtype=torch.bool),
+            names.EXTRA_FLAT: self.is_flat,
             names.NEXT_PROPRIO: torch.randn(self.num_envs, 4),
             "log": {"Perf/physics_time": torch.tensor(0.0)},
         }

@@ -6,8 +6,10 @@ import pytest
 import torch
 
 from kiras_rl.algorithms.kiras import TASK
+from kiras_rl.algorithms.losses import retention_loss
 from kiras_rl.algorithms.residual import Reference
 from kiras_rl.phases import FINETUNING
+from kiras_rl.schema import RetentionConfig
 
 
 @pytest.fixture
@@ -65,15 +67,34 @@ def test_the_reference_stays_while_the_policy_moves(begin):
 
 def test_the_residual_reward_is_the_distance_of_what_was_done(make_runner):
     alg = make_runner().alg
-    obs = alg.storage.observations[0]
-    mean = alg.policy()(obs["proprio"], obs["history"])[0]
-    reference = Reference(alg.policy(), weight=0.15, flat_weight=1.0)
+    obs = alg.storage.observations[0].clone()
+    mean = alg.policy()(obs["proprio"], obs["history"])[0].detach()
+    reference = Reference(alg.policy(), RetentionConfig(0.15, 1.0), reward_scale=0.02)
     away = mean + torch.tensor([0.3, -0.4])  # 0.5 from the reference
     is_flat = torch.arange(len(mean)) % 2 == 0
-    reward = reference.reward(obs, away, mean, is_flat)
-    assert torch.allclose(reward[::2], torch.tensor(-0.5), atol=1e-6)
-    assert torch.allclose(reward[1::2], torch.tensor(-0.15 * 0.5), atol=1e-6)
-    assert reference.mean_distance() == pytest.approx(0.0, abs=1e-6)  # of the mean action
+    reward = reference.record(obs, away, is_flat)
+    assert torch.allclose(reward, torch.tensor(-0.15 * 0.02 * 0.5), atol=1e-7)
+    assert torch.allclose(obs["flat_action"], mean)
+    assert torch.equal(obs["is_flat"][:, 0], is_flat)
+
+
+def test_the_loss_is_the_squared_distance_on_flat_ground():
+    mean = torch.tensor([[0.3, -0.4], [1.0, 1.0], [0.0, 2.0]])
+    flat = torch.tensor([True, False, True])
+    assert retention_loss(mean, torch.zeros(3, 2), flat) == pytest.approx((0.25 + 4.0) / 2)
+    assert retention_loss(mean, torch.zeros(3, 2), ~flat & flat) == 0.0
+
+
+def test_on_flat_ground_the_policy_is_pulled_back(make_runner):
+    """Nothing but the loss: no advantage, a policy away from its reference."""
+    runner = make_runner("finetuning.retention.flat_loss_weight=100", phase=FINETUNING)
+    runner.env.is_flat = torch.arange(16) % 2 == 0
+    with torch.no_grad():
+        runner.alg.actor.mlp[-1].bias += 0.5
+    seen = []
+    runner.learn(on_iteration=lambda status: seen.append(status.scalars))
+    assert seen[0]["Residual/distance_flat"] > 0.6
+    assert seen[-1]["Residual/distance_flat"] < 0.5 * seen[0]["Residual/distance_flat"]
 
 
 def test_the_clock_counts_over_both_phases(begin):
