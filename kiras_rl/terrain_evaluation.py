@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -111,9 +112,9 @@ class TerrainResult:
         return scalars
 
 
-def rough_types(env: SkillEnv) -> list[int]:
+def rough_types(terrains: Sequence[str]) -> list[int]:
     """Return the indices of the terrain types that are not flat."""
-    return [index for index, name in enumerate(env.terrains) if name != "flat"]
+    return [index for index, name in enumerate(terrains) if name != "flat"]
 
 
 def evaluate_terrain(
@@ -128,7 +129,7 @@ def evaluate_terrain(
         level: Difficulty level.
         speeds: Lowest and highest commanded v_x, spread evenly over the trials of a cell, m/s.
     """
-    types, count = rough_types(env), len(env.skills)
+    types, count = rough_types(env.terrains), len(env.skills)
     terrain = torch.tensor(types, device=env.device).repeat_interleave(count * robots)
     skill = torch.arange(count, device=env.device).repeat_interleave(robots).repeat(len(types))
     # The middle of as many equal parts of the range as there are trials.

@@ -16,11 +16,12 @@ from rich.table import Table
 from kiras_rl.checkpoint import CheckpointError
 from kiras_rl.config import ConfigError, config_from_dict, load_config
 from kiras_rl.deploy.metadata import PolicyError
+from kiras_rl.envs.terrain_library import build_library
 from kiras_rl.evaluation import Policy, SkillResult, evaluate_skills
 from kiras_rl.phases import FINETUNING, SKILL_LEARNING, phase_config
 from kiras_rl.robots.robot import RobotError, load_robot
 from kiras_rl.schema import Config
-from kiras_rl.terrain_evaluation import TIME_LIMIT, evaluate_terrain
+from kiras_rl.terrain_evaluation import TIME_LIMIT, evaluate_terrain, rough_types
 from kiras_rl.tools.evaluator import (
     FLOOR,
     make_evaluation_env,
@@ -142,8 +143,8 @@ def _terrain(config: Config, policy: Policy, args: argparse.Namespace) -> dict:
         raise ConfigError("this policy's configuration has no terrain: finetuning=null in its run")
     config.env.terrain.levels = LEVELS
     skills = load_robot(config.robot).skills
-    types = [name for name in config.env.terrain.types if name != "flat"]
-    env = make_evaluation_env(config, args.trials * len(types) * len(skills), TIME_LIMIT)
+    count = len(rough_types(build_library(config.env.terrain).types))
+    env = make_evaluation_env(config, args.trials * count * len(skills), TIME_LIMIT)
     report = {}
     for level in args.levels:
         result = evaluate_terrain(env, policy, args.trials, level, SPEEDS)

@@ -14,13 +14,19 @@ from kiras_rl.config import ConfigError
 from kiras_rl.deploy.policy import OnboardPolicy
 from kiras_rl.envs import make_env
 from kiras_rl.envs.quadruped import QuadrupedEnv
+from kiras_rl.envs.terrain_library import build_library
 from kiras_rl.evaluation import SETTLE, Policy, SkillResult, evaluate_skills
 from kiras_rl.interfaces import HISTORY, PROPRIO
 from kiras_rl.phases import FINETUNING, phase_config
 from kiras_rl.robots.robot import load_robot
 from kiras_rl.runner import Evaluators
 from kiras_rl.schema import Config
-from kiras_rl.terrain_evaluation import TIME_LIMIT, TerrainResult, evaluate_terrain
+from kiras_rl.terrain_evaluation import (
+    TIME_LIMIT,
+    TerrainResult,
+    evaluate_terrain,
+    rough_types,
+)
 
 FLOOR = {"height": 0.03, "pitch": math.radians(5.0), "velocity": 0.12, "falls": 0.05}
 """What a skill must reach to be called learned: m, rad, m/s, share of robots."""
@@ -42,7 +48,7 @@ def make_evaluators(config: Config, phase: str, device: str) -> Evaluators:
     The one on flat ground is the same in both phases: it shows what finetuning forgets.
 
     Raises:
-        ConfigError: A duration that leaves nothing to count, or a level that there is not.
+        ConfigError: A duration that leaves nothing to count.
     """
     if not config.evaluation.interval:
         return Evaluators()
@@ -69,20 +75,33 @@ def _make_flat_evaluator(config: Config, device: str) -> Callable[[Policy], dict
 def _make_terrain_evaluator(config: Config, device: str) -> Callable[[Policy], TerrainResult]:
     settings = config.evaluation.terrain
     rough = phase_config(config, FINETUNING)
-    levels = rough.env.terrain.levels
-    if not 0 <= settings.level < levels:
-        raise ConfigError(
-            f"evaluation.terrain.level={settings.level}: allowed are 0 to {levels - 1}, see levels "
-            "of finetuning.env.terrain"
-        )
-    types = [name for name in rough.env.terrain.types if name != "flat"]
-    num_envs = settings.robots * len(types) * len(load_robot(config.robot).skills)
+    count = len(rough_types(build_library(rough.env.terrain).types))
+    num_envs = settings.robots * count * len(load_robot(config.robot).skills)
     env = make_evaluation_env(rough, num_envs, TIME_LIMIT, device)
 
     def evaluate(policy: Policy) -> TerrainResult:
         return evaluate_terrain(env, policy, settings.robots, settings.level, settings.command)
 
     return evaluate
+
+
+def check_terrain(config: Config) -> None:
+    """Make the terrain of finetuning once.
+
+    Raises:
+        ConfigError: If it cannot be, or has no such level as the evaluation asks for.
+    """
+    terrain, level = phase_config(config, FINETUNING).env.terrain, config.evaluation.terrain.level
+    if terrain is None:
+        raise ConfigError(
+            "finetuning.env.terrain=null: finetuning needs terrain, or set finetuning=null"
+        )
+    build_library(terrain)
+    if not 0 <= level < terrain.levels:
+        raise ConfigError(
+            f"evaluation.terrain.level={level}: allowed are 0 to {terrain.levels - 1}, see levels "
+            "of finetuning.env.terrain"
+        )
 
 
 def terrain_table(result: TerrainResult) -> Table:

@@ -25,7 +25,6 @@ from kiras_rl.config import (
 )
 from kiras_rl.deploy.policy import OnboardPolicy, PolicyError, PolicyMetadata
 from kiras_rl.envs import make_env, resolve_backend
-from kiras_rl.envs.terrain_library import build_library
 from kiras_rl.export import ExportError, export_policy
 from kiras_rl.phases import (
     FINETUNING,
@@ -39,6 +38,7 @@ from kiras_rl.runner import KirasRunner, TrainingError
 from kiras_rl.schema import Config
 from kiras_rl.tools.curves import draw_curves
 from kiras_rl.tools.evaluator import (
+    check_terrain,
     make_evaluators,
     onboard_policy,
     results_table,
@@ -136,10 +136,8 @@ def train(cfg: str | None, resume: Path | None, overrides: list[str], runs: Path
 
 def _check(config: Config) -> None:
     """Refuse now what a later phase could not use, not after hours of training."""
-    for phase in phases_of(config):
-        terrain = phase_config(config, phase).env.terrain
-        if terrain:
-            build_library(terrain)
+    if config.finetuning:
+        check_terrain(config)
 
 
 def _next_phase(before: KirasRunner) -> KirasRunner:

@@ -40,15 +40,19 @@ def smoke(tmp_path_factory):
 
 def test_a_run_holds_all_that_was_promised(smoke):
     assert load_config(str(smoke / "config.yaml")) == load_config("smoke")
-    for name in ("latest.pt", "best.pt"):
+    for name, iteration in (("flat.pt", 2), ("latest.pt", 4), ("best.pt", 4)):
         content = load_checkpoint(smoke / "checkpoints" / name)
-        assert content["iteration"] == 2
-        assert content["description"]["provenance"]["steps"] == 2 * 24 * 8
+        assert content["iteration"] == iteration
+        assert content["phase"] == ("skill_learning" if iteration == 2 else "finetuning")
+        assert content["description"]["provenance"]["steps"] == iteration * 24 * 8
     picture = matplotlib.image.imread(smoke / "curves.png")
     assert min(picture.shape[:2]) > 300
     scalars = read_scalars(smoke)
-    assert scalars["Critic/task_reward"][0] == [1, 2]
-    assert scalars["Eval/score"][0] == [2]
+    assert scalars["Critic/task_reward"][0] == [1, 2, 3, 4]
+    assert scalars["Critic/imitation_reward"][0] == [1, 2]
+    assert scalars["Eval/score"][0] == [2, 4]
+    assert scalars["Terrain/level_stairs"][0] == [3, 4]
+    assert scalars["Eval_terrain/strict_stairs"][0] == [4]
 
 
 def test_its_policy_file_is_the_checkpoint_s_policy(smoke):
@@ -65,13 +69,13 @@ def test_its_policy_file_is_the_checkpoint_s_policy(smoke):
 
 
 def test_it_says_what_to_do_next(smoke, capsys):
-    assert main(["--resume", str(smoke), "iterations=3"]) == 0
+    assert main(["--resume", str(smoke), "finetuning.iterations=3"]) == 0
     out = capsys.readouterr().out
-    assert "resuming at iteration 2" in out
-    assert "3/3" in out
+    assert "resuming at iteration 4" in out
+    assert "5/5" in out
     assert f"kiras-play {smoke}" in out
-    assert load_checkpoint(smoke / "checkpoints" / "latest.pt")["iteration"] == 3
-    assert read_scalars(smoke)["Critic/task_reward"][0] == [1, 2, 3]
+    assert load_checkpoint(smoke / "checkpoints" / "latest.pt")["iteration"] == 5
+    assert read_scalars(smoke)["Critic/task_reward"][0] == [1, 2, 3, 4, 5]
 
 
 def test_two_runs_begun_at_once_get_two_folders(tmp_path):
@@ -90,7 +94,9 @@ def test_a_checkpoint_outside_of_a_run_is_not_resumed(smoke, tmp_path, capsys):
 def test_a_file_of_one_s_own_without_imitation_and_evaluation_ends_as_well(tmp_path):
     mine = tmp_path / "mine.yaml"
     mine.write_text(
-        "extends: ablations/no_sil\nnum_envs: 4\niterations: 1\nevaluation: {interval: 0}\n"
+        "extends: ablations/no_sil\nnum_envs: 4\niterations: 1\n"
+        "evaluation: {interval: 0, terrain: {level: 0}}\n"
+        "finetuning: {iterations: 1, env: {terrain: {levels: 2, variants: 2}}}\n"
     )
     assert main(["--cfg", str(mine), "--runs", str(tmp_path / "runs")]) == 0
     run = only_run(tmp_path / "runs", "mine")
@@ -126,6 +132,9 @@ def refusal(capsys, *argv):
         (["--cfg", "smoke", "evaluation.duration=1"], "more than the first 1.0 s"),
         (["--cfg", "smoke", "env.observations.proprio.foot_height={}"], "unknown observation term"),
         (["--cfg", "smoke", "env.action_clip=0"], "action_clip must be positive"),
+        (["--cfg", "smoke", "evaluation.terrain.level=2"], "terrain.level=2: allowed are 0 to 1"),
+        (["--cfg", "smoke", "finetuning.env.terrain.types.hills={}"], "no term 'hills'"),
+        (["--cfg", "smoke", "finetuning.learner.ppo.gama=1"], "did you mean 'learner.ppo.gamma'?"),
         (["--resume", "runs/nothing"], "does not exist: give a run folder or a checkpoint file"),
     ],
 )
@@ -169,6 +178,7 @@ def test_the_command_line_is_checked_first(capsys):
 def test_a_terminated_training_saves_and_goes_on(tmp_path, capsys):
     command = [sys.executable, "-m", "kiras_rl.tools.train", "--cfg", "smoke", "--runs", "."]
     overrides = ["iterations=100000", "evaluation.interval=0", "checkpoint_minutes=999"]
+    overrides.append("finetuning=null")
     process = subprocess.Popen(
         command + overrides, cwd=tmp_path, text=True, stdout=subprocess.PIPE,
         stderr=subprocess.PIPE, env=os.environ | {"OMP_WAIT_POLICY": "passive"},
