@@ -282,7 +282,7 @@ class KirasPPO(PPO):
         on_flat = (distance * weight).sum() / weight.sum().clamp(min=1.0)
         return {
             "Residual/distance": distance.mean().item(),
-            "Residual/distance_flat": on_flat.item(),
+            "Residual/flat_distance": on_flat.item(),
         }
 
     # --- construction, modes, state -------------------------------------------------------------

@@ -93,8 +93,8 @@ def test_on_flat_ground_the_policy_is_pulled_back(make_runner):
         runner.alg.actor.mlp[-1].bias += 0.5
     seen = []
     runner.learn(on_iteration=lambda status: seen.append(status.scalars))
-    assert seen[0]["Residual/distance_flat"] > 0.6
-    assert seen[-1]["Residual/distance_flat"] < 0.5 * seen[0]["Residual/distance_flat"]
+    assert seen[0]["Residual/flat_distance"] > 0.6
+    assert seen[-1]["Residual/flat_distance"] < 0.5 * seen[0]["Residual/flat_distance"]
 
 
 def test_the_clock_counts_over_both_phases(begin):

@@ -7,6 +7,7 @@ import math
 import pytest
 import torch
 
+from kiras_rl import terrain_evaluation
 from kiras_rl.config import load_config
 from kiras_rl.envs import make_env
 from kiras_rl.envs.terrains import CROSSED
@@ -171,10 +172,11 @@ class Slide:
         return action
 
 
-def test_who_gets_far_enough_in_time_succeeds(build):
+def test_who_gets_far_enough_in_time_succeeds(build, monkeypatch):
+    monkeypatch.setattr(terrain_evaluation, "TIME_LIMIT", 2.5)
     env = build("env.terminations.episode_length=21")
     terrain = torch.full((8,), env.terrains.index("flat"))
-    speed = torch.tensor([0.3, 0.3, 0.6, 0.6, 0.12, 0.12, 0.3, 0.3])
+    speed = torch.tensor([1.5, 1.5, 3.0, 3.0, 1.0, 1.0, 1.5, 1.5])
     trials = Trials(terrain, torch.zeros_like(terrain), torch.zeros_like(terrain), speed)
     slow = torch.arange(8) >= 6
 
@@ -188,7 +190,7 @@ def test_who_gets_far_enough_in_time_succeeds(build):
             return action
 
     outcomes = run_trials(env, Idle(env), trials)
-    # 3 m at 0.12 m/s take longer than 20 s, and the last two do not move
+    # 3 m at 1 m/s take longer than 2.5 s, and the last two do not move
     assert outcomes.success.tolist() == 4 * [True] + 4 * [False]
     assert not outcomes.fell.any()
     assert torch.equal(outcomes.strict, outcomes.success)
@@ -196,7 +198,7 @@ def test_who_gets_far_enough_in_time_succeeds(build):
 
 def test_shares_are_those_of_type_and_skill(build):
     env = build("num_envs=20", "env.terminations.episode_length=21")
-    result = evaluate_terrain(env, holding_policy(env), robots=1, level=0, speeds=(0.6, 0.6))
+    result = evaluate_terrain(env, holding_policy(env), robots=1, level=0, speeds=(3.0, 3.0))
     assert result.terrains == ("slopes", "bars", "footholds", "stairs")
     assert result.success.shape == (4, 5)
     assert result.score() == pytest.approx(2.0)  # who holds its pose gets nowhere

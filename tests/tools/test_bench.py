@@ -108,7 +108,7 @@ def test_the_report_says_where_and_with_what_it_was_measured(bench):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("--parts=speed",), "no part 'speed'; there are physics, learning, inference"),
+        (("--parts=speed",), "no part 'speed'; there are physics, terrain, learning, inference"),
         (("--worlds=0",), "'0' is not a number of at least 1"),
         (("--rounds=many",), "'many' is not a number of at least 1"),
     ],
