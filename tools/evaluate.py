@@ -36,6 +36,8 @@ DESCRIPTION = """\
 Measure a policy without action noise, on robots drawn by the paper's domain randomization, with
 sensor noise, actuation delay and pushes.
 
+Without --protocol: flat, transitions and, for a policy that was finetuned, terrain.
+
 flat         every skill walks straight ahead for 20 s; height and pitch errors are those of a 0.4 s
              moving average after the first second, the velocity error is that of each step
 transitions  every ordered pair of skills, switched while walking: falls, and time until the moving
@@ -124,7 +126,8 @@ def evaluate(args: argparse.Namespace) -> dict:
         _verdict(results)
     if args.protocol in ("all", "transitions"):
         report["transitions"] = _transitions(config, policy, skills, args)
-    if args.protocol == "terrain" or (args.protocol == "all" and whole.finetuning):
+    finetuned = metadata.provenance.get("iterations", 0) > whole.iterations
+    if args.protocol == "terrain" or (args.protocol == "all" and finetuned):
         rough = _physics(phase_config(whole, FINETUNING), args.nominal)
         report["terrain"] = _terrain(rough, policy, args)
     return report
