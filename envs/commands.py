@@ -84,6 +84,8 @@ class TaskSampler:
     def draw_command(self) -> torch.Tensor:
         """Return new commands, (N, 3)."""
         command = self._low + (self._high - self._low) * self._random["command"]
+        forward, least = command[:, 0], self._commands.least_lin_vel_x
+        command[:, 0] = forward.abs().clamp(min=least).copysign(forward)
         zero = self._chance("command_zero", self._commands.zero_probability)
         return command * (~zero)[:, None]
 

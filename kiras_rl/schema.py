@@ -50,6 +50,7 @@ class CommandConfig:
     lin_vel_x: tuple[float, float]
     lin_vel_y: tuple[float, float]
     ang_vel_z: tuple[float, float]
+    least_lin_vel_x: float
     zero_probability: float
     resample_probability: float
     heading_probability: float
