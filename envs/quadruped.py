@@ -9,27 +9,27 @@ import torch
 from tensordict import TensorDict
 
 from kiras_rl import interfaces as names
-from kiras_rl.envs import commands, curriculum, randomization, rotations, terminations
+from kiras_rl.envs import commands, curriculum, randomization, terminations
 from kiras_rl.envs.commands import TaskSampler
 from kiras_rl.envs.curriculum import Curriculum
 from kiras_rl.envs.description import describe_deployment
 from kiras_rl.envs.ground import Ground
 from kiras_rl.envs.kinematics import FootKinematics
-from kiras_rl.envs.model import Scene, build_scene
+from kiras_rl.envs.model import build_scene
 from kiras_rl.envs.observations import View
 from kiras_rl.envs.observer import NOISE, Observer
+from kiras_rl.envs.postures import Postures
 from kiras_rl.envs.randomization import Randomizer
-from kiras_rl.envs.randomness import UniformBuffer, scale_to
+from kiras_rl.envs.randomness import UniformBuffer
 from kiras_rl.envs.rewards import RewardSum
-from kiras_rl.envs.simulation.base import Simulation
+from kiras_rl.envs.simulation.build import make_simulation
 from kiras_rl.envs.state import CONTACT_FORCE, Keyframes, RobotState, Step, Task
-from kiras_rl.envs.terrain_library import TerrainLibrary, build_library
+from kiras_rl.envs.terrain_library import build_library
 from kiras_rl.envs.terrains import CROSSED
 from kiras_rl.interfaces import Measurements, SkillEnv
 from kiras_rl.robots.robot import Robot
 from kiras_rl.schema import EnvConfig, SimConfig
 
-SPAWN_CLEARANCE = 0.002  # m between the lowest foot and the ground at a reset
 KEYFRAME_COMMANDS = (0.0, 0.4, 0.8)  # of the largest v_x, for the value of a skill
 
 
@@ -54,8 +54,15 @@ class QuadrupedEnv(SkillEnv):
         self.step_dt = sim_cfg.timestep * sim_cfg.substeps
         self.max_episode_length = round(cfg.terminations.episode_length / self.step_dt)
         self._library = build_library(cfg.terrain) if cfg.terrain else None
-        self.scene = _build_scene(robot, sim_cfg, cfg, self._library)
-        self.sim = _make_simulation(self.scene, sim_cfg, num_envs, backend, device)
+        delay = cfg.randomization.action_delay
+        self.scene = build_scene(
+            robot,
+            sim_cfg.timestep,
+            sim_cfg.solver_iterations,
+            max_delay=delay[1] if delay else 0,
+            library=self._library,
+        )
+        self.sim = make_simulation(self.scene, sim_cfg, num_envs, backend, device)
         self.keyframes = Keyframes.of(robot, device)
         self.keyframe_height, self.keyframe_pitch = self.keyframes.height, self.keyframes.pitch
         self._ground = None
@@ -70,12 +77,6 @@ class QuadrupedEnv(SkillEnv):
 
     def _allocate(self, robot: Robot) -> None:
         n, device = self.num_envs, self.device
-
-        def tensor(values: object) -> torch.Tensor:
-            return torch.tensor(values, dtype=torch.float32, device=device)
-
-        self._default_joint_pos = tensor(robot.default_joint_pos)
-        self._action_scale = tensor(robot.action_scale)
         self._all = torch.ones(n, dtype=torch.bool, device=device)
         index = torch.zeros(n, dtype=torch.int64, device=device)
         self.task = Task.of(torch.zeros(n, 3, device=device), index, index)
@@ -85,13 +86,16 @@ class QuadrupedEnv(SkillEnv):
         self._last_joint_vel = torch.zeros(n, self.num_actions, device=device)
         self._last_joint_torque = torch.zeros(n, self.num_actions, device=device)
         self._measurements: Measurements | None = None
-        self._kinematics = FootKinematics(self.scene.model, robot, device)
-        self.robot = RobotState(self.sim, self.scene.sensors, self._kinematics, self._ground)
+        kinematics = FootKinematics(self.scene.model, robot, device)
+        self.robot = RobotState(self.sim, self.scene.sensors, kinematics, self._ground)
+        self._postures = Postures(robot, self.keyframes, kinematics, self._ground, self.cfg.skills)
 
     def _build_terms(self, seed: int) -> None:
         cfg = self.cfg
         self._observer = Observer(cfg.observations, self._view())
-        self.keyframe_features = self._features_of_keyframes()
+        skills = torch.arange(len(self.skills), device=self.device)
+        at_rest = self._postures.at_rest(skills, torch.zeros(len(skills), 3, device=self.device))
+        self.keyframe_features = self._observer.imitation(at_rest)
         self.feature_noise = self._observer.imitation.noise
         self._rewards = RewardSum(cfg.rewards, self.step_dt, self.device)
         generator = torch.Generator(device=self.device)
@@ -144,7 +148,7 @@ class QuadrupedEnv(SkillEnv):
         last_action = self._action
         self._action = actions.clamp(-self.cfg.action_clip, self.cfg.action_clip)
         begin = time.perf_counter()
-        self.sim.step(self._joint_targets(self._action))
+        self.sim.step(self._postures.joint_targets(self._action))
         self._physics_time = time.perf_counter() - begin
         self._length = self._length + 1
         self.robot.read_step()
@@ -176,9 +180,6 @@ class QuadrupedEnv(SkillEnv):
     def _distance(self) -> torch.Tensor:
         """Return how far bases are from the middle of their tile, max(|x|, |y|), (N,), m."""
         return self.robot.base_pos_w[:, :2].abs().amax(dim=1)
-
-    def _joint_targets(self, action: torch.Tensor) -> torch.Tensor:
-        return self._default_joint_pos + self._action_scale * action
 
     def _fallen(self) -> torch.Tensor:
         limits = self.cfg.terminations
@@ -238,12 +239,11 @@ class QuadrupedEnv(SkillEnv):
             self._write_terrain(
                 mask, self._placed if placed else self._curriculum.tiles(self.task.skill)
             )
-        qpos, qvel = self._initial_state(start)
+        qpos, qvel = self._postures.draw_begin(start, self._random)
         joint_pos = qpos[:, 7:]
         self.sim.write_state(mask, qpos, qvel, joint_pos)
         # The targets that hold the start pose: what was "commanded" before the episode.
-        holding = (joint_pos - self._default_joint_pos) / self._action_scale
-        self._action = torch.where(mask[:, None], holding, self._action)
+        self._action = torch.where(mask[:, None], self._postures.holding(joint_pos), self._action)
         self._last_joint_torque = torch.where(mask[:, None], 0.0, self._last_joint_torque)
         self._length = torch.where(mask, 0, self._length)
 
@@ -251,30 +251,11 @@ class QuadrupedEnv(SkillEnv):
         self._ground.write(mask, tile)
         self.sim.write_terrain(mask, tile)
 
-    def _initial_state(self, start: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return qpos (N, 7 + J) and qvel (N, 6 + J) near the keyframes `start`."""
-        frames, skills = self.keyframes, self.cfg.skills
-        n = self.num_envs
-        noise = skills.joint_noise
-        joint_pos = frames.joint_pos[start] + scale_to(self._random["joint"], -noise, noise)
-        qpos = torch.zeros(n, 7 + self.num_actions, device=self.device)
-        pitch = frames.pitch[start]
-        yaw = torch.zeros_like(pitch)
-        qpos[:, 2] = SPAWN_CLEARANCE - self._kinematics.lowest_foot(pitch, joint_pos)
-        if self._ground:  # on the platform in the middle, with any heading
-            yaw = scale_to(self._random["yaw"][:, 0], -math.pi, math.pi)
-            qpos[:, 2] += self._ground.spawn_height
-        qpos[:, 3:7] = rotations.quat_from_pitch_yaw(pitch, yaw)
-        qpos[:, 7:] = joint_pos
-        qvel = torch.zeros(n, 6 + self.num_actions, device=self.device)
-        speed = skills.velocity_noise
-        qvel[:, :2] = scale_to(self._random["velocity"], -speed, speed)
-        return qpos, qvel
-
     # --- observations -------------------------------------------------------------------------
 
     def _view(self) -> View:
-        return View(self.robot, self.task, self.keyframes, self._default_joint_pos, self._action)
+        q0 = self._postures.default_joint_pos
+        return View(self.robot, self.task, self.keyframes, q0, self._action)
 
     def _observe(self, begun: torch.Tensor) -> TensorDict:
         return self._observer.observe(self._view(), begun, self._random)
@@ -370,11 +351,6 @@ class QuadrupedEnv(SkillEnv):
         """Return the measurements of the last step, before its resets."""
         return self._measurements
 
-    def _features_of_keyframes(self) -> torch.Tensor:
-        """Return Phi in each keyframe at rest, (S, D)."""
-        skills = torch.arange(len(self.skills), device=self.device)
-        return self._observer.imitation(self._at_rest(skills, torch.zeros(len(skills), 3)))
-
     def keyframe_observations(self) -> torch.Tensor:
         """Return critic observations at rest in each keyframe for G commands, (S, G, C)."""
         count, grid = len(self.skills), len(KEYFRAME_COMMANDS)
@@ -382,14 +358,8 @@ class QuadrupedEnv(SkillEnv):
         command = torch.zeros(count * grid, 3, device=self.device)
         largest = self.cfg.commands.lin_vel_x[1]
         command[:, 0] = largest * torch.tensor(KEYFRAME_COMMANDS, device=self.device).repeat(count)
-        view = self._at_rest(skills, command)
+        view = self._postures.at_rest(skills, command)
         return self._observer.privileged(view).unflatten(0, (count, grid))
-
-    def _at_rest(self, skill: torch.Tensor, command: torch.Tensor) -> View:
-        robot = RobotState.at_rest(self.keyframes, skill, len(self.robot_cfg.foot_geoms))
-        action = (robot.joint_pos - self._default_joint_pos) / self._action_scale
-        task = Task.of(command.to(self.device), skill, skill)
-        return View(robot, task, self.keyframes, self._default_joint_pos, action)
 
     def describe(self) -> dict:
         """Return the deployment contract of a policy trained here."""
@@ -436,40 +406,3 @@ _BUFFERS = (
 def _unless(mask: torch.Tensor, new: torch.Tensor, old: torch.Tensor) -> torch.Tensor:
     """Return `new` (N, k), with `old` in the masked worlds (N,)."""
     return torch.where(mask[:, None], old, new)
-
-
-def _build_scene(
-    robot: Robot, sim_cfg: SimConfig, cfg: EnvConfig, library: TerrainLibrary | None
-) -> Scene:
-    delay = cfg.randomization.action_delay
-    return build_scene(
-        robot,
-        sim_cfg.timestep,
-        sim_cfg.solver_iterations,
-        max_delay=delay[1] if delay else 0,
-        library=library,
-    )
-
-
-def _make_simulation(
-    scene: Scene, sim_cfg: SimConfig, num_worlds: int, backend: str, device: torch.device
-) -> Simulation:
-    if backend == "native":
-        from kiras_rl.envs.simulation.native import NativeSimulation
-
-        return NativeSimulation(
-            scene.model, num_worlds, sim_cfg.substeps, sim_cfg.threads, scene.terrain
-        )
-    # Imported late: it takes seconds, and a CPU user never needs it.
-    from kiras_rl.envs.simulation.warp import WarpSimulation
-
-    return WarpSimulation(
-        scene.model,
-        num_worlds,
-        sim_cfg.substeps,
-        device,
-        max_contacts=sim_cfg.max_contacts,
-        max_constraints=sim_cfg.max_constraints,
-        max_ccd=sim_cfg.max_ccd,
-        terrain=scene.terrain,
-    )

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import difflib
+from dataclasses import asdict
+from functools import cache
 from pathlib import Path
+from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
@@ -51,7 +54,7 @@ def config_from_dict(values: dict, overrides: list[str] | tuple[str, ...] = ()) 
         ConfigError: As `load_config`.
     """
     source = "the saved configuration"
-    saved = _merge(OmegaConf.structured(Config), values, source)
+    saved = _merge(_schema(), values, source)
     base = OmegaConf.create(_read_chain("base")[0])
     younger = OmegaConf.create()
     for key in OmegaConf.missing_keys(saved):
@@ -70,7 +73,7 @@ def config_from_layers(layers: list[dict], source: str) -> Config:
 
 def config_to_dict(config: Config) -> dict:
     """Return a configuration as nested plain values, ready for YAML and checkpoints."""
-    return OmegaConf.to_container(OmegaConf.structured(config), resolve=True)
+    return _plain(asdict(config))
 
 
 def save_config(config: Config, path: Path) -> None:
@@ -99,8 +102,21 @@ def list_configs() -> list[str]:
     return sorted(n.as_posix() for n in names)
 
 
+def _plain(value: Any) -> Any:
+    """Return nested mappings and sequences as dicts and lists."""
+    if isinstance(value, dict):
+        return {key: _plain(item) for key, item in value.items()}
+    return [_plain(item) for item in value] if isinstance(value, list | tuple) else value
+
+
+@cache
+def _schema() -> DictConfig:
+    """Return the typed configuration without values: to merge into, never to change."""
+    return OmegaConf.structured(Config)
+
+
 def _resolve(layers: list[dict], overrides: list[str], source: str) -> Config:
-    config = OmegaConf.structured(Config)
+    config = _schema()
     for layer in layers:
         config = _merge(config, layer, source)
     for item in overrides:

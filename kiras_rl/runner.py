@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import signal
 import time
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -22,6 +20,12 @@ from kiras_rl.deploy.metadata import FORMAT as METADATA_FORMAT
 from kiras_rl.evaluation import Policy, SkillResult, as_scalars, score
 from kiras_rl.interfaces import SkillEnv
 from kiras_rl.phases import FINETUNING, SKILL_LEARNING, phase_config, total_iterations
+from kiras_rl.process import (
+    StopRequest,
+    generator_states,
+    set_generator_states,
+    single_threaded,
+)
 from kiras_rl.schema import Config
 from kiras_rl.terrain_evaluation import TerrainResult
 
@@ -294,7 +298,7 @@ class KirasRunner(OnPolicyRunner):
             "best_networks": self.best_networks,
             "learner": self.alg.save(),
             "env": self.env.state_dict(),
-            "generators": _generator_states(),
+            "generators": generator_states(),
             "policy": policy.state_dict(),
             "policy_shape": policy.shape(),
             "description": self.describe_policy(),
@@ -338,7 +342,7 @@ class KirasRunner(OnPolicyRunner):
         self.current_learning_iteration = content["iteration"]
         self.seconds, self.best_score = content["seconds"], content["best_score"]
         self.best_networks = content["best_networks"]
-        _set_generator_states(content["generators"])
+        set_generator_states(content["generators"])
         return content["infos"]
 
     def begin_from(self, path: Path) -> None:
@@ -369,46 +373,6 @@ class KirasRunner(OnPolicyRunner):
         return content
 
 
-class StopRequest:
-    """Turns SIGINT and SIGTERM into a flag while the context is open."""
-
-    def __enter__(self) -> StopRequest:
-        """Install the handlers; outside the main thread there are none to install."""
-        self.requested = False
-        self._old = {}
-        with suppress(ValueError):
-            for number in (signal.SIGINT, signal.SIGTERM):
-                self._old[number] = signal.signal(number, self._request)
-        return self
-
-    def _request(self, number: int, frame: object) -> None:
-        self.requested = True
-        signal.signal(number, self._old[number])  # a second one acts at once
-
-    def __exit__(self, *_: object) -> None:
-        """Restore the handlers."""
-        for number, handler in self._old.items():
-            signal.signal(number, handler)
-
-
-class single_threaded:  # noqa: N801  (used like a function)
-    """Keeps torch to one thread on a CPU: OpenMP's waiting threads would starve the physics."""
-
-    def __init__(self, device: str) -> None:
-        """Do nothing on a GPU."""
-        self._threads = torch.get_num_threads() if torch.device(device).type == "cpu" else None
-
-    def __enter__(self) -> None:
-        """Leave one thread."""
-        if self._threads is not None:
-            torch.set_num_threads(1)
-
-    def __exit__(self, *_: object) -> None:
-        """Give the threads back."""
-        if self._threads is not None:
-            torch.set_num_threads(self._threads)
-
-
 def _rsl_rl_config(config: Config, phase: str, step_dt: float) -> dict:
     alone = phase_config(config, phase)
     finetuning = config.finetuning if phase == FINETUNING else None
@@ -421,16 +385,3 @@ def _rsl_rl_config(config: Config, phase: str, step_dt: float) -> dict:
         "num_steps_per_env": alone.learner.ppo.num_steps,
         "save_interval": 0,
     }
-
-
-def _generator_states() -> dict[str, torch.Tensor]:
-    states = {"cpu": torch.get_rng_state()}
-    if torch.cuda.is_available():
-        states["cuda"] = torch.cuda.get_rng_state()
-    return states
-
-
-def _set_generator_states(states: dict[str, torch.Tensor]) -> None:
-    torch.set_rng_state(states["cpu"])
-    if "cuda" in states and torch.cuda.is_available():
-        torch.cuda.set_rng_state(states["cuda"])

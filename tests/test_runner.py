@@ -13,7 +13,8 @@ from kiras_rl.checkpoint import CheckpointError, load_checkpoint, save_checkpoin
 from kiras_rl.config import list_configs, load_config
 from kiras_rl.envs import make_env
 from kiras_rl.phases import FINETUNING, SKILL_LEARNING, phase_config
-from kiras_rl.runner import Evaluators, KirasRunner, StopRequest
+from kiras_rl.process import StopRequest
+from kiras_rl.runner import Evaluators, KirasRunner
 
 # Noise, randomization and delay are on; episodes and premium windows end many times.
 TINY = (

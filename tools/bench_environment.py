@@ -16,7 +16,7 @@ from kiras_rl.envs import make_env
 from kiras_rl.envs.quadruped import QuadrupedEnv
 from kiras_rl.envs.simulation.base import RANDOMISED_FIELDS
 from kiras_rl.phases import FINETUNING, SKILL_LEARNING, phase_config
-from kiras_rl.runner import single_threaded
+from kiras_rl.process import single_threaded
 from kiras_rl.schema import Config, SimConfig
 from kiras_rl.tools.timing import PartTimer, Times, interleave
 

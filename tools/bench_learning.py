@@ -18,7 +18,8 @@ from torch import nn
 from kiras_rl import interfaces as names
 from kiras_rl.envs import make_env
 from kiras_rl.envs.quadruped import QuadrupedEnv
-from kiras_rl.runner import KirasRunner, single_threaded
+from kiras_rl.process import single_threaded
+from kiras_rl.runner import KirasRunner
 from kiras_rl.schema import Config, LearnerConfig
 from kiras_rl.tools.timing import PartTimer, Times, interleave
 

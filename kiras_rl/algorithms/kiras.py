@@ -14,6 +14,7 @@ from torch import nn
 from kiras_rl import interfaces as names
 from kiras_rl.algorithms import losses, returns
 from kiras_rl.algorithms.estimation import Estimation
+from kiras_rl.algorithms.parts import Parts, build_parts
 from kiras_rl.algorithms.residual import Reference
 from kiras_rl.algorithms.storage import GroupRolloutStorage, mini_batches
 from kiras_rl.imitation.self_imitation import SelfImitation
@@ -22,7 +23,6 @@ from kiras_rl.models.critics import GroupCritic
 from kiras_rl.models.exported import ExportedPolicy
 from kiras_rl.schedules import advantage_weights, piecewise_linear
 from kiras_rl.schema import LearnerConfig
-from kiras_rl.skills import SkillSampler
 
 TASK, IMITATION = 0, 1  # reward groups
 
@@ -37,25 +37,13 @@ class KirasPPO(PPO):
     critic: GroupCritic
     storage: GroupRolloutStorage
 
-    def __init__(
-        self,
-        actor: MLPModel,
-        critic: GroupCritic,
-        storage: GroupRolloutStorage,
-        config: LearnerConfig,
-        iterations: int,
-        imitation: SelfImitation | None,
-        estimation: Estimation | None,
-        sampler: SkillSampler | None,
-        reference: Reference | None,
-        device: str,
-    ) -> None:
-        """Take the parts; see `construct_algorithm`."""
+    def __init__(self, parts: Parts, config: LearnerConfig, iterations: int, device: str) -> None:
+        """Take the parts; `iterations` is the length of the phase."""
         ppo = config.ppo
         super().__init__(
-            actor,
-            critic,
-            storage,
+            parts.actor,
+            parts.critic,
+            parts.storage,
             num_learning_epochs=ppo.num_epochs,
             num_mini_batches=ppo.num_mini_batches,
             clip_param=ppo.clip_param,
@@ -67,13 +55,13 @@ class KirasPPO(PPO):
             max_grad_norm=ppo.max_grad_norm,
             device=device,
         )
-        parameters = chain(actor.parameters(), critic.parameters())
+        parameters = chain(parts.actor.parameters(), parts.critic.parameters())
         self.optimizer = torch.optim.Adam(parameters, lr=ppo.learning_rate, fused=True)
         self.config = config
         self.iterations = iterations
         self.iteration = 0
-        self.imitation, self.estimation, self.sampler = imitation, estimation, sampler
-        self.reference = reference
+        self.imitation, self.estimation = parts.imitation, parts.estimation
+        self.sampler, self.reference = parts.sampler, parts.reference
         self._apply_schedules()
 
     @property
@@ -289,54 +277,9 @@ class KirasPPO(PPO):
 
     @staticmethod
     def construct_algorithm(obs: TensorDict, env: SkillEnv, cfg: dict, device: str) -> KirasPPO:
-        """Build the networks for the observations of an environment.
-
-        Args:
-            obs: A first observation; gains the groups that the learner itself writes.
-            env: The environment.
-            cfg: rsl-rl's dictionary; `learner` holds the LearnerConfig, `iterations` is the length
-                of the phase, `retention` holds its RetentionConfig, None in a phase without a
-                reference, `reward_scale` the factor of all rewards of a step.
-            device: Where networks and storage live.
-        """
-        config: LearnerConfig = cfg["learner"]
-        ppo = config.ppo
-        estimation = Estimation.build(config.estimator, obs, env, device)
-        if estimation:
-            obs[names.CONTEXT] = estimation.context(obs)
-        obs[names.NEXT_PROPRIO] = torch.zeros_like(obs[names.PROPRIO])
-        if cfg["retention"] is not None:
-            obs[names.FLAT_ACTION] = torch.zeros(len(obs), env.num_actions, device=device)
-            obs[names.IS_FLAT] = torch.zeros(len(obs), 1, dtype=torch.bool, device=device)
-        imitation = SelfImitation.build(config.imitation, obs, env, ppo.num_steps, device)
-        groups = {
-            "actor": [names.PROPRIO, names.CONTEXT if estimation else names.HISTORY],
-            "critic": [names.CRITIC],
-        }
-        has_two = imitation is not None and config.multi_critic is not None
-        storage = GroupRolloutStorage(
-            env.num_envs, ppo.num_steps, 2 if has_two else 1, obs, env.num_actions, device
-        )
-        sampler = (
-            SkillSampler(config.skill_init, len(env.skills), device) if config.skill_init else None
-        )
-        actor = _build_actor(obs, groups, env.num_actions, config).to(device)
-        retention, reference = cfg["retention"], None
-        if retention is not None:
-            policy = ExportedPolicy(estimation.estimator if estimation else None, actor.mlp)
-            reference = Reference(policy, retention, cfg["reward_scale"])
-        return KirasPPO(
-            actor=actor,
-            critic=GroupCritic(obs, groups, 2 if has_two else 1, list(ppo.critic_dims)).to(device),
-            storage=storage,
-            config=config,
-            iterations=cfg["iterations"],
-            imitation=imitation,
-            estimation=estimation,
-            sampler=sampler,
-            reference=reference,
-            device=device,
-        )
+        """Build the learner of a phase; see `build_parts` for the arguments."""
+        parts = build_parts(obs, env, cfg, device)
+        return KirasPPO(parts, config=cfg["learner"], iterations=cfg["iterations"], device=device)
 
     def networks(self) -> dict:
         """Return copies of all weights that go on into the next phase."""
@@ -399,20 +342,3 @@ class KirasPPO(PPO):
             "reference": self.reference,
         }
         return {name: part for name, part in parts.items() if part is not None}
-
-
-def _build_actor(
-    obs: TensorDict, groups: dict[str, list[str]], num_actions: int, config: LearnerConfig
-) -> MLPModel:
-    distribution = {
-        "class_name": "GaussianDistribution",
-        "init_std": config.ppo.action_std[0][1],
-        "learn_std": False,
-    }
-    actor = MLPModel(
-        obs, groups, "actor", num_actions, list(config.ppo.actor_dims), "elu", False, distribution
-    )
-    # First actions near zero: the robot begins in its default pose, not in a random one.
-    nn.init.normal_(actor.mlp[-1].weight, std=0.01)
-    nn.init.zeros_(actor.mlp[-1].bias)
-    return actor

@@ -209,6 +209,17 @@ def test_commands_stay_in_their_ranges_and_some_ask_to_stand(build_env):
     torch.testing.assert_close(high, torch.tensor([0.6, 0.2, 0.6]), atol=0.03, rtol=0)
 
 
+def test_no_moving_command_is_slower_than_the_least(build_env):
+    env = build_env("env.commands.least_lin_vel_x=0.25", num_envs=300)
+    forward = env.reset()[names.COMMAND][:, 0]
+    moving = forward[forward != 0]
+    assert moving.abs().min() == pytest.approx(0.25)
+    # Of -0.3 to 0.6 m/s, 3 in 9 go backwards, 5 in 9 are raised to the least.
+    assert (moving < 0).float().mean().item() == pytest.approx(3 / 9, abs=0.1)
+    slowest = moving.abs() < 0.25 + 1e-6
+    assert slowest.float().mean().item() == pytest.approx(5 / 9, abs=0.1)
+
+
 # --- ends ----------------------------------------------------------------------------------------
 
 

@@ -1,0 +1,63 @@
+"""What a training shares with its process: signals, threads and global random numbers."""
+
+from __future__ import annotations
+
+import signal
+from contextlib import suppress
+
+import torch
+
+
+class StopRequest:
+    """Turns SIGINT and SIGTERM into a flag while the context is open."""
+
+    def __enter__(self) -> StopRequest:
+        """Install the handlers; outside the main thread there are none to install."""
+        self.requested = False
+        self._old = {}
+        with suppress(ValueError):
+            for number in (signal.SIGINT, signal.SIGTERM):
+                self._old[number] = signal.signal(number, self._request)
+        return self
+
+    def _request(self, number: int, frame: object) -> None:
+        self.requested = True
+        signal.signal(number, self._old[number])  # a second one acts at once
+
+    def __exit__(self, *_: object) -> None:
+        """Restore the handlers."""
+        for number, handler in self._old.items():
+            signal.signal(number, handler)
+
+
+class single_threaded:  # noqa: N801  (used like a function)
+    """Keeps torch to one thread on a CPU: OpenMP's waiting threads would starve the physics."""
+
+    def __init__(self, device: str) -> None:
+        """Do nothing on a GPU."""
+        self._threads = torch.get_num_threads() if torch.device(device).type == "cpu" else None
+
+    def __enter__(self) -> None:
+        """Leave one thread."""
+        if self._threads is not None:
+            torch.set_num_threads(1)
+
+    def __exit__(self, *_: object) -> None:
+        """Give the threads back."""
+        if self._threads is not None:
+            torch.set_num_threads(self._threads)
+
+
+def generator_states() -> dict[str, torch.Tensor]:
+    """Return the states of torch's global generators."""
+    states = {"cpu": torch.get_rng_state()}
+    if torch.cuda.is_available():
+        states["cuda"] = torch.cuda.get_rng_state()
+    return states
+
+
+def set_generator_states(states: dict[str, torch.Tensor]) -> None:
+    """Go on with what `generator_states` returned."""
+    torch.set_rng_state(states["cpu"])
+    if "cuda" in states and torch.cuda.is_available():
+        torch.cuda.set_rng_state(states["cuda"])
