@@ -17,11 +17,12 @@ from kiras_rl.checkpoint import CheckpointError
 from kiras_rl.config import ConfigError, config_from_dict, load_config
 from kiras_rl.deploy.metadata import PolicyError
 from kiras_rl.envs.terrain_library import build_library
-from kiras_rl.evaluation import Policy, SkillResult, evaluate_skills
+from kiras_rl.evaluation.flat import Policy, SkillResult, evaluate_skills
+from kiras_rl.evaluation.terrain import TIME_LIMIT, evaluate_terrain, rough_types
+from kiras_rl.evaluation.transitions import Transitions, evaluate_transitions
 from kiras_rl.phases import FINETUNING, SKILL_LEARNING, phase_config
 from kiras_rl.robots.robot import RobotError, load_robot
 from kiras_rl.schema import Config
-from kiras_rl.terrain_evaluation import TIME_LIMIT, evaluate_terrain, rough_types
 from kiras_rl.tools.evaluator import (
     FLOOR,
     make_evaluation_env,
@@ -30,7 +31,6 @@ from kiras_rl.tools.evaluator import (
     terrain_table,
 )
 from kiras_rl.tools.policy_files import load_policy
-from kiras_rl.transitions import Transitions, evaluate_transitions
 
 DESCRIPTION = """\
 Measure a policy without action noise, on robots drawn by the paper's domain randomization, with

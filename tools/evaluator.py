@@ -15,18 +15,18 @@ from kiras_rl.deploy.policy import OnboardPolicy
 from kiras_rl.envs import make_env
 from kiras_rl.envs.quadruped import QuadrupedEnv
 from kiras_rl.envs.terrain_library import build_library
-from kiras_rl.evaluation import SETTLE, Policy, SkillResult, evaluate_skills
-from kiras_rl.interfaces import HISTORY, PROPRIO
-from kiras_rl.phases import FINETUNING, phase_config
-from kiras_rl.robots.robot import load_robot
-from kiras_rl.runner import Evaluators
-from kiras_rl.schema import Config
-from kiras_rl.terrain_evaluation import (
+from kiras_rl.evaluation.flat import SETTLE, Policy, SkillResult, evaluate_skills
+from kiras_rl.evaluation.terrain import (
     TIME_LIMIT,
     TerrainResult,
     evaluate_terrain,
     rough_types,
 )
+from kiras_rl.interfaces import HISTORY, PROPRIO
+from kiras_rl.phases import FINETUNING, phase_config
+from kiras_rl.robots.robot import load_robot
+from kiras_rl.runner import Evaluators
+from kiras_rl.schema import Config
 
 FLOOR = {"height": 0.03, "pitch": math.radians(5.0), "velocity": 0.12, "falls": 0.05}
 """What a skill must reach to be called learned: m, rad, m/s, share of robots."""

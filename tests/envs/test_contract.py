@@ -9,7 +9,7 @@ from rsl_rl.runners import OnPolicyRunner
 from kiras_rl import interfaces as names
 from kiras_rl.config import ConfigError
 from kiras_rl.envs import resolve_backend
-from kiras_rl.evaluation import evaluate_skills
+from kiras_rl.evaluation.flat import evaluate_skills
 from kiras_rl.robots.robot import list_robots, load_robot
 
 WORLDS = 10

@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from kiras_rl.evaluation import (
+from kiras_rl.evaluation.flat import (
     Recording,
     SkillResult,
     as_scalars,
