@@ -65,6 +65,8 @@ class QuadrupedEnv(SkillEnv):
         self.sim = make_simulation(self.scene, sim_cfg, num_envs, backend, device)
         self.keyframes = Keyframes.of(robot, device)
         self.keyframe_height, self.keyframe_pitch = self.keyframes.height, self.keyframes.pitch
+        self.keyframe_joint_pos = self.keyframes.joint_pos
+        self.mass = float(self.scene.model.body_subtreemass[self.scene.base_body])
         self._ground = None
         if self._library:
             self._ground = Ground(self._library, num_envs, device)
@@ -86,9 +88,11 @@ class QuadrupedEnv(SkillEnv):
         self._last_joint_vel = torch.zeros(n, self.num_actions, device=device)
         self._last_joint_torque = torch.zeros(n, self.num_actions, device=device)
         self._measurements: Measurements | None = None
-        kinematics = FootKinematics(self.scene.model, robot, device)
-        self.robot = RobotState(self.sim, self.scene.sensors, kinematics, self._ground)
-        self._postures = Postures(robot, self.keyframes, kinematics, self._ground, self.cfg.skills)
+        self._kinematics = FootKinematics(self.scene.model, robot, device)
+        self.robot = RobotState(self.sim, self.scene.sensors, self._kinematics, self._ground)
+        self._postures = Postures(
+            robot, self.keyframes, self._kinematics, self._ground, self.cfg.skills
+        )
 
     def _build_terms(self, seed: int) -> None:
         cfg = self.cfg
@@ -268,6 +272,10 @@ class QuadrupedEnv(SkillEnv):
             roll=robot.roll_pitch[:, 0],
             lin_vel_h=robot.base_lin_vel_h,
             yaw_rate=robot.yaw_rate,
+            gravity_b=robot.gravity_b,
+            joint_pos=robot.joint_pos.clone(),
+            joint_vel=robot.joint_vel.clone(),
+            joint_torque=robot.joint_torque.clone(),
             foot_contact=robot.foot_contact,
             limb_contact=(robot.limb_force > CONTACT_FORCE).any(dim=1),
             distance=self._distance(),
@@ -350,6 +358,10 @@ class QuadrupedEnv(SkillEnv):
     def measure(self) -> Measurements:
         """Return the measurements of the last step, before its resets."""
         return self._measurements
+
+    def foot_height_b(self, gravity_b: torch.Tensor, joint_pos: torch.Tensor) -> torch.Tensor:
+        """Return the height of each foot's lowest point above the base, (N, F), m."""
+        return self._kinematics.foot_height_b(gravity_b, joint_pos)
 
     def keyframe_observations(self) -> torch.Tensor:
         """Return critic observations at rest in each keyframe for G commands, (S, G, C)."""

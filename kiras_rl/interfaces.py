@@ -1,7 +1,7 @@
 """The contract between learning and simulation: every name that crosses it, with its shape.
 
 Letters: N worlds, P proprioceptive numbers, H frames of history, C critic numbers, D imitation
-features, S skills, F feet.
+features, S skills, J joints, F feet.
 """
 
 from __future__ import annotations
@@ -69,6 +69,10 @@ class Measurements:
         roll: rad.
         lin_vel_h: Base velocity in the heading frame, (N, 3), m/s.
         yaw_rate: rad/s about the vertical.
+        gravity_b: Unit vector of gravity in the base frame, (N, 3).
+        joint_pos: (N, J), rad.
+        joint_vel: (N, J), rad/s.
+        joint_torque: (N, J), N m, a physics step before the rest.
         foot_contact: Feet on the ground, (N, F) bool.
         limb_contact: Worlds where a thigh or shank touched the ground, bool.
         distance: How far the base is from the middle of its tile, the larger of |x| and |y|, m.
@@ -80,6 +84,10 @@ class Measurements:
     roll: torch.Tensor
     lin_vel_h: torch.Tensor
     yaw_rate: torch.Tensor
+    gravity_b: torch.Tensor
+    joint_pos: torch.Tensor
+    joint_vel: torch.Tensor
+    joint_torque: torch.Tensor
     foot_contact: torch.Tensor
     limb_contact: torch.Tensor
     distance: torch.Tensor
@@ -110,6 +118,12 @@ class SkillEnv(VecEnv):
 
     keyframe_pitch: torch.Tensor
     """Pitch of each keyframe, (S,), rad."""
+
+    keyframe_joint_pos: torch.Tensor
+    """Joint angles of each keyframe, (S, J), rad."""
+
+    mass: float
+    """Mass of the robot before randomization, kg."""
 
     terrains: tuple[str, ...] = ()
     """Names of the terrain types; none where all ground is flat."""
@@ -165,6 +179,15 @@ class SkillEnv(VecEnv):
     @abstractmethod
     def measure(self) -> Measurements:
         """Return the measurements of the last step."""
+
+    @abstractmethod
+    def foot_height_b(self, gravity_b: torch.Tensor, joint_pos: torch.Tensor) -> torch.Tensor:
+        """Return the height of each foot's lowest point above the base, (N, F), m.
+
+        Args:
+            gravity_b: Unit vector of gravity in the base frame, (N, 3).
+            joint_pos: Joint angles, (N, J), rad.
+        """
 
     @abstractmethod
     def describe(self) -> dict:

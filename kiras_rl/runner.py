@@ -17,7 +17,8 @@ from kiras_rl import __version__, checkpoint
 from kiras_rl.algorithms.kiras import KirasPPO
 from kiras_rl.config import config_to_dict
 from kiras_rl.deploy.metadata import FORMAT as METADATA_FORMAT
-from kiras_rl.evaluation import Policy, SkillResult, as_scalars, score
+from kiras_rl.evaluation.flat import Policy, SkillResult, as_scalars, score
+from kiras_rl.evaluation.terrain import TerrainResult
 from kiras_rl.interfaces import SkillEnv
 from kiras_rl.phases import FINETUNING, SKILL_LEARNING, phase_config, total_iterations
 from kiras_rl.process import (
@@ -27,7 +28,6 @@ from kiras_rl.process import (
     single_threaded,
 )
 from kiras_rl.schema import Config
-from kiras_rl.terrain_evaluation import TerrainResult
 
 
 class TrainingError(ValueError):

@@ -40,6 +40,7 @@ ANYTHING = Rule(("",))
 RULES = {  # the longest name that fits a module counts
     "kiras_rl": LEARNING,
     "kiras_rl.config": LEARNING._replace(may=(*LEARNING.may, "omegaconf")),
+    "kiras_rl.evaluation.dtw": LEARNING._replace(may=(*LEARNING.may, "dtaidistance")),
     "kiras_rl.export": LEARNING._replace(may=(*LEARNING.may, "onnxruntime")),  # the parity check
     "kiras_rl.deploy": Rule(("numpy", "onnxruntime", "kiras_rl.deploy")),
     "kiras_rl.robots": Rule(("numpy", "mujoco", "yaml", "kiras_rl.robots")),

@@ -54,7 +54,7 @@ def make_runner(tmp_path):
 @pytest.fixture
 def tell():
     """Return a function that sums up a run's evaluations as a constant result."""
-    from kiras_rl.evaluation import SkillResult
+    from kiras_rl.evaluation.flat import SkillResult
 
     return lambda error: {"walk": SkillResult(0.2, 0.0, 0.3, error, 0.0, 0.0, 2.0, 1.0, 0.0)}
 

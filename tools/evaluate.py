@@ -3,43 +3,46 @@
 from __future__ import annotations
 
 import argparse
+import copy
 import json
 import math
 import sys
 from dataclasses import asdict
 from pathlib import Path
 
-import torch
 from rich.console import Console
-from rich.table import Table
 
 from kiras_rl.checkpoint import CheckpointError
 from kiras_rl.config import ConfigError, config_from_dict, load_config
 from kiras_rl.deploy.metadata import PolicyError
 from kiras_rl.envs.terrain_library import build_library
-from kiras_rl.evaluation import Policy, SkillResult, evaluate_skills
+from kiras_rl.evaluation.flat import SETTLE, Policy, SkillResult, evaluate_skills
+from kiras_rl.evaluation.imitation import STEPS, evaluate_imitation
+from kiras_rl.evaluation.terrain import TIME_LIMIT, evaluate_terrain, rough_types
+from kiras_rl.evaluation.transitions import evaluate_transitions
 from kiras_rl.phases import FINETUNING, SKILL_LEARNING, phase_config
 from kiras_rl.robots.robot import RobotError, load_robot
 from kiras_rl.schema import Config
-from kiras_rl.terrain_evaluation import TIME_LIMIT, evaluate_terrain, rough_types
-from kiras_rl.tools.evaluator import (
-    FLOOR,
-    make_evaluation_env,
-    onboard_policy,
+from kiras_rl.tools.evaluator import FLOOR, make_evaluation_env, onboard_policy
+from kiras_rl.tools.policy_files import load_policy
+from kiras_rl.tools.tables import (
+    imitation_tables,
     results_table,
     terrain_table,
+    transitions_table,
 )
-from kiras_rl.tools.policy_files import load_policy
-from kiras_rl.transitions import Transitions, evaluate_transitions
 
 DESCRIPTION = """\
 Measure a policy without action noise, on robots drawn by the paper's domain randomization, with
 sensor noise, actuation delay and pushes.
 
-Without --protocol: flat, transitions and, for a policy that was finetuned, terrain.
+Without --protocol: flat, imitation, transitions and, for a policy that was finetuned, terrain.
 
 flat         every skill walks straight ahead for 20 s; height and pitch errors are those of a 0.4 s
              moving average after the first second, the velocity error is that of each step
+imitation    every skill walks straight ahead, without pushes; of the 120 steps after the first
+             second: distance (dynamic time warping) and cosine to the keyframe, errors of height
+             and pitch, the nearest keyframe; foot clearance, stepping, torques, power
 transitions  every ordered pair of skills, switched while walking: falls, and time until the moving
              averages of height (1.5 cm) and pitch (3 degrees) stay at the new keyframe for 0.3 s;
              a robot that was not in the first skill before the switch counts as not settled
@@ -53,11 +56,12 @@ EXAMPLES = """\
 examples:
   kiras-evaluate                              the policy shipped with Solo-8
   kiras-evaluate runs/solo8_quick/2026-01-31_12-00-00
+  kiras-evaluate policy.onnx --protocol imitation --json imitation.json
   kiras-evaluate policy.onnx --protocol transitions --trials 50 --json transitions.json
   kiras-evaluate policy.onnx --protocol terrain --levels 4,5 --trials 100
 """
 
-PROTOCOLS = ("all", "flat", "transitions", "terrain")
+PROTOCOLS = ("all", "flat", "imitation", "transitions", "terrain")
 
 LEVELS = 11
 """Of the terrain protocol, whatever the training had: steps of a tenth from lowest to top."""
@@ -91,10 +95,12 @@ def _parse(argv: list[str] | None) -> argparse.Namespace:
     parser.add_argument("policy", nargs="?", type=Path, help="run folder, checkpoint or ONNX file")
     parser.add_argument("--robot", help="whose shipped policy, if none is given (solo8)")
     parser.add_argument("--protocol", choices=PROTOCOLS, default="all")
-    parser.add_argument("--robots", type=int, default=100, help="robots a skill (flat)")
+    parser.add_argument(
+        "--robots", type=_count, default=100, help="robots a skill (flat, imitation)"
+    )
     parser.add_argument("--duration", type=float, default=20.0, help="s a robot (flat)")
     parser.add_argument(
-        "--trials", type=int, default=50, help="of a pair (transitions), or of a cell (terrain)"
+        "--trials", type=_count, default=50, help="of a pair (transitions), or of a cell (terrain)"
     )
     parser.add_argument(
         "--levels", type=_levels, default="0,2,4,6,8,10", help="of terrain, 0 to 10"
@@ -124,6 +130,8 @@ def evaluate(args: argparse.Namespace) -> dict:
         console.print(results_table(results, f"flat: {args.robots} robots a skill"))
         report["flat"] = {name: asdict(result) for name, result in results.items()}
         _verdict(results)
+    if args.protocol in ("all", "imitation"):
+        report["imitation"] = _imitation(config, policy, skills, args)
     if args.protocol in ("all", "transitions"):
         report["transitions"] = _transitions(config, policy, skills, args)
     finetuned = metadata.provenance.get("iterations", 0) > whole.iterations
@@ -131,6 +139,23 @@ def evaluate(args: argparse.Namespace) -> dict:
         rough = _physics(phase_config(whole, FINETUNING), args.nominal)
         report["terrain"] = _terrain(rough, policy, args)
     return report
+
+
+def _imitation(config: Config, policy: Policy, skills: int, args: argparse.Namespace) -> dict:
+    config = copy.deepcopy(config)
+    config.env.randomization.push_velocity = None
+    duration = SETTLE + STEPS * config.sim.timestep * config.sim.substeps
+    env = make_evaluation_env(config, args.robots * skills, duration)
+    result = evaluate_imitation(env, policy, args.command)
+    for table in imitation_tables(result, args.robots):
+        console.print(table)
+    return result.as_dict()
+
+
+def _count(text: str) -> int:
+    if not text.isdigit() or int(text) < 1:
+        raise argparse.ArgumentTypeError(f"'{text}': give a number of at least 1")
+    return int(text)
 
 
 def _levels(text: str) -> list[int]:
@@ -185,7 +210,7 @@ def _transitions(config: Config, policy: Policy, skills: int, args: argparse.Nam
     worlds = skills * (skills - 1) * args.trials
     env = make_evaluation_env(config, worlds, 10.0)
     result = evaluate_transitions(env, policy, args.trials, args.command)
-    console.print(_transition_table(result, env.skills))
+    console.print(transitions_table(result, env.skills))
     fell, settled = result.overall()
     console.print(f"falls {100 * fell:.1f} %, settled within 2 s {100 * settled:.1f} %")
     return {
@@ -195,28 +220,6 @@ def _transitions(config: Config, policy: Policy, skills: int, args: argparse.Nam
         "settle_time": result.settle_time.nan_to_num().tolist(),
         "overall": {"fell": fell, "settled": settled},
     }
-
-
-def _transition_table(result: Transitions, skills: tuple[str, ...]) -> Table:
-    title = f"transitions: settled %, mean settle time s, falls % ({result.trials} trials a pair)"
-    table = Table(title=title, title_justify="left")
-    table.add_column("from / to")
-    for skill in skills:
-        table.add_column(skill, justify="right")
-    for i, first in enumerate(skills):
-        cells = [
-            ""
-            if i == j
-            else _cell(result.settled[i, j], result.settle_time[i, j], result.fell[i, j])
-            for j in range(len(skills))
-        ]
-        table.add_row(first, *cells)
-    return table
-
-
-def _cell(settled: torch.Tensor, time: torch.Tensor, fell: torch.Tensor) -> str:
-    falls = f" [red]{100 * fell:.0f}[/]" if fell > 0 else ""
-    return f"{100 * settled:.0f} {time:.2f}{falls}"
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""The evaluation environment of a configuration, and tables of its results."""
+"""The evaluation environment of a configuration, and the evaluations beside a training."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ import math
 from collections.abc import Callable
 
 import torch
-from rich.table import Table
 from tensordict import TensorDict
 
 from kiras_rl.config import ConfigError
@@ -15,18 +14,18 @@ from kiras_rl.deploy.policy import OnboardPolicy
 from kiras_rl.envs import make_env
 from kiras_rl.envs.quadruped import QuadrupedEnv
 from kiras_rl.envs.terrain_library import build_library
-from kiras_rl.evaluation import SETTLE, Policy, SkillResult, evaluate_skills
-from kiras_rl.interfaces import HISTORY, PROPRIO
-from kiras_rl.phases import FINETUNING, phase_config
-from kiras_rl.robots.robot import load_robot
-from kiras_rl.runner import Evaluators
-from kiras_rl.schema import Config
-from kiras_rl.terrain_evaluation import (
+from kiras_rl.evaluation.flat import SETTLE, Policy, SkillResult, evaluate_skills
+from kiras_rl.evaluation.terrain import (
     TIME_LIMIT,
     TerrainResult,
     evaluate_terrain,
     rough_types,
 )
+from kiras_rl.interfaces import HISTORY, PROPRIO
+from kiras_rl.phases import FINETUNING, phase_config
+from kiras_rl.robots.robot import load_robot
+from kiras_rl.runner import Evaluators
+from kiras_rl.schema import Config
 
 FLOOR = {"height": 0.03, "pitch": math.radians(5.0), "velocity": 0.12, "falls": 0.05}
 """What a skill must reach to be called learned: m, rad, m/s, share of robots."""
@@ -104,21 +103,6 @@ def check_terrain(config: Config) -> None:
         )
 
 
-def terrain_table(result: TerrainResult) -> Table:
-    """Return a table of the shares of success: terrain types by skills."""
-    title = f"terrain, level {result.level}: success %, in brackets without knees"
-    table = Table(title=title, title_justify="left")
-    table.add_column("terrain")
-    for skill in result.skills:
-        table.add_column(skill, justify="right")
-    for name, success, strict in zip(
-        result.terrains, result.success.tolist(), result.strict.tolist(), strict=True
-    ):
-        cells = [f"{100 * a:.0f} ({100 * b:.0f})" for a, b in zip(success, strict, strict=True)]
-        table.add_row(name, *cells)
-    return table
-
-
 def onboard_policy(policy: OnboardPolicy) -> Policy:
     """Return observation -> mean actions of a policy file: what is measured is what is deployed."""
 
@@ -127,25 +111,3 @@ def onboard_policy(policy: OnboardPolicy) -> Policy:
         return torch.from_numpy(actions).to(obs.device)
 
     return act
-
-
-def results_table(results: dict[str, SkillResult], title: str) -> Table:
-    """Return a table with one row a skill; green rows reach FLOOR."""
-    columns = ("skill", "height", "error", "pitch", "error", "v_x", "error", "lifts", "falls")
-    units = ("", "cm", "cm", "deg", "deg", "m/s", "m/s", "1/s", "%")
-    table = Table(title=title, title_justify="left")
-    for column, unit in zip(columns, units, strict=True):
-        table.add_column(f"{column}\n{unit}", justify="right" if unit else "left")
-    for skill, r in results.items():
-        row = (
-            f"{100 * r.height:.1f}",
-            f"{100 * r.height_error:.1f}",
-            f"{math.degrees(r.pitch):+.1f}",
-            f"{math.degrees(r.pitch_error):.1f}",
-            f"{r.velocity:+.2f}",
-            f"{r.velocity_error:.2f}",
-            f"{r.lifts:.1f}",
-            f"{100 * r.falls:.0f}",
-        )
-        table.add_row(skill, *row, style="green" if r.meets(**FLOOR) else "yellow")
-    return table

@@ -26,7 +26,7 @@ AVERAGE = 0.4  # s over which height and pitch are averaged: about two strides
 
 @dataclass(frozen=True)
 class SkillSummary:
-    """Mean absolute errors of one skill, once settled, as in `kiras_rl.evaluation`; SI units."""
+    """Mean absolute errors of one skill, once settled, as in `kiras_rl.evaluation.flat`; SI."""
 
     skill: str
     height_error: float

@@ -37,14 +37,9 @@ from kiras_rl.robots.robot import RobotError
 from kiras_rl.runner import KirasRunner, TrainingError
 from kiras_rl.schema import Config
 from kiras_rl.tools.curves import draw_curves
-from kiras_rl.tools.evaluator import (
-    check_terrain,
-    make_evaluators,
-    onboard_policy,
-    results_table,
-    terrain_table,
-)
+from kiras_rl.tools.evaluator import check_terrain, make_evaluators, onboard_policy
 from kiras_rl.tools.progress import Progress
+from kiras_rl.tools.tables import results_table, terrain_table
 
 DESCRIPTION = """\
 Train one policy for all skills of a robot.

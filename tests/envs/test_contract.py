@@ -9,7 +9,7 @@ from rsl_rl.runners import OnPolicyRunner
 from kiras_rl import interfaces as names
 from kiras_rl.config import ConfigError
 from kiras_rl.envs import resolve_backend
-from kiras_rl.evaluation import evaluate_skills
+from kiras_rl.evaluation.flat import evaluate_skills
 from kiras_rl.robots.robot import list_robots, load_robot
 
 WORLDS = 10
@@ -89,6 +89,23 @@ def test_a_step_returns_what_was_promised(env, robot):
     assert extras[names.NEXT_PROPRIO].shape == obs[names.PROPRIO].shape
     parts = [value for key, value in extras["log"].items() if key.startswith("Reward/")]
     torch.testing.assert_close(torch.stack(parts).sum(), rewards.mean())
+
+
+def test_measurements_outlive_the_next_step(env):
+    env.step(actions(env))
+    now = env.measure()
+    kept = {name: value.clone() for name, value in vars(now).items()}
+    env.step(actions(env))
+    assert all(torch.equal(getattr(now, name), value) for name, value in kept.items())
+
+
+def test_the_height_of_the_feet_follows_from_what_is_measured(robot, build_env):
+    env = build_env(f"robot={robot.name}", *NOMINAL, num_envs=WORLDS)
+    env.step(actions(env))
+    now = env.measure()
+    height = now.base_height[:, None] + env.foot_height_b(now.gravity_b, now.joint_pos)
+    assert not now.fallen.any()
+    torch.testing.assert_close(height, env.robot.foot_height)
 
 
 def test_the_same_seed_gives_the_same_motion(robot, build_env):

@@ -7,12 +7,11 @@ import math
 import pytest
 import torch
 
-from kiras_rl import terrain_evaluation
 from kiras_rl.config import load_config
 from kiras_rl.envs import make_env
 from kiras_rl.envs.terrains import CROSSED
+from kiras_rl.evaluation.terrain import Trials, evaluate_terrain, run_trials
 from kiras_rl.phases import FINETUNING, phase_config
-from kiras_rl.terrain_evaluation import Trials, evaluate_terrain, run_trials
 
 CALM = (
     "num_envs=8",
@@ -173,7 +172,7 @@ class Slide:
 
 
 def test_who_gets_far_enough_in_time_succeeds(build, monkeypatch):
-    monkeypatch.setattr(terrain_evaluation, "TIME_LIMIT", 2.5)
+    monkeypatch.setattr("kiras_rl.evaluation.terrain.TIME_LIMIT", 2.5)
     env = build("env.terminations.episode_length=21")
     terrain = torch.full((8,), env.terrains.index("flat"))
     speed = torch.tensor([1.5, 1.5, 3.0, 3.0, 1.0, 1.0, 1.5, 1.5])

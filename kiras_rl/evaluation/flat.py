@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 
 import torch
 from tensordict import TensorDict
 
-from kiras_rl.interfaces import SkillEnv
+from kiras_rl.interfaces import Measurements, SkillEnv
 
 SETTLE = 1.0  # s that are not counted
 AVERAGE = 0.4  # s of the moving average of height and pitch: about two strides
@@ -79,29 +79,51 @@ def evaluate_skills(
         duration: Of each trial, s.
         command: v_x, m/s.
     """
-    skill = torch.arange(env.num_envs, device=env.device) % len(env.skills)
-    commands = torch.zeros(env.num_envs, 3, device=env.device)
-    commands[:, 0] = command
-    recording = record(env, policy, duration, skill, commands)
+    recording = record(env, policy, duration, *deal_skills(env, command))
     return summarize(recording, env)
 
 
 @torch.no_grad()
-def record(
+def walk(
     env: SkillEnv, policy: Policy, duration: float, skill: torch.Tensor, command: torch.Tensor
-) -> Recording:
-    """Run the policy from the keyframes of `skill` (N,) with constant commands (N, 3)."""
+) -> Iterator[tuple[Measurements, torch.Tensor]]:
+    """Run the policy from the keyframes of `skill` (N,) with constant commands (N, 3).
+
+    Yields:
+        What was measured after each step, and which robots have not fallen until then, (N,) bool.
+    """
     env.seed(SEED)
     obs = env.reset(skill, command)
     alive = torch.ones(env.num_envs, dtype=torch.bool, device=env.device)
-    steps = []
     for _ in range(round(duration / env.step_dt)):
         obs = env.step(policy(obs))[0]
         now = env.measure()
         alive = alive & ~now.fallen
-        steps.append((now.base_height, now.pitch, now.lin_vel_h[:, 0], now.foot_contact, alive))
-    height, pitch, velocity, contact, alive_at = (torch.stack(x) for x in zip(*steps, strict=True))
-    return Recording(skill, command, height, pitch, velocity, contact, alive_at, env.step_dt)
+        yield now, alive
+
+
+def record(
+    env: SkillEnv, policy: Policy, duration: float, skill: torch.Tensor, command: torch.Tensor
+) -> Recording:
+    """Walk as `walk` does, and keep what the protocol counts."""
+    steps = [
+        (now.base_height, now.pitch, now.lin_vel_h[:, 0], now.foot_contact, alive)
+        for now, alive in walk(env, policy, duration, skill, command)
+    ]
+    height, pitch, velocity, contact, alive = (torch.stack(x) for x in zip(*steps, strict=True))
+    return Recording(skill, command, height, pitch, velocity, contact, alive, env.step_dt)
+
+
+def deal_skills(env: SkillEnv, command: float) -> tuple[torch.Tensor, torch.Tensor]:
+    """Deal the worlds to the skills in turn.
+
+    Returns:
+        The skills, (N,), and the commands straight ahead at `command` m/s, (N, 3).
+    """
+    skill = torch.arange(env.num_envs, device=env.device) % len(env.skills)
+    commands = torch.zeros(env.num_envs, 3, device=env.device)
+    commands[:, 0] = command
+    return skill, commands
 
 
 def summarize(recording: Recording, env: SkillEnv) -> dict[str, SkillResult]:
@@ -120,7 +142,9 @@ def summarize(recording: Recording, env: SkillEnv) -> dict[str, SkillResult]:
         "height_error": _mean((height - target_height).abs(), alive),
         "pitch_error": _mean((pitch - target_pitch).abs(), alive),
         "velocity_error": _mean((velocity - recording.command[:, 0]).abs(), alive),
-        "lifts": lifts_per_second(recording.contact[start:], recording.step_dt),
+        "lifts": lifts_per_second(
+            recording.contact[start:], recording.alive[start:], recording.step_dt
+        ).amin(dim=-1),
         "falls": 1.0 - recording.alive[-1].float(),
     }
     per_robot["distinct"] = _distinct(per_robot["height"], per_robot["pitch"], recording, env)
@@ -139,15 +163,16 @@ def moving_average(signal: torch.Tensor, step_dt: float) -> torch.Tensor:
     return padded.unfold(0, width, 1).mean(dim=-1)
 
 
-def lifts_per_second(contact: torch.Tensor, step_dt: float) -> torch.Tensor:
-    """Return how often the least lifted foot of each robot leaves the ground, (N,), 1/s.
+def lifts_per_second(contact: torch.Tensor, alive: torch.Tensor, step_dt: float) -> torch.Tensor:
+    """Return how often each foot leaves the ground before the robot falls, (N, F), 1/s.
 
     Args:
         contact: (T, N, F) bool.
+        alive: Steps before the fall, (T, N) bool.
         step_dt: s.
     """
-    lifted = contact[:-1] & ~contact[1:]
-    return lifted.float().sum(dim=0).amin(dim=-1) / (len(contact) * step_dt)
+    lifted = contact[:-1] & ~contact[1:] & alive[1:, :, None]
+    return lifted.sum(dim=0) / (alive.sum(dim=0).clamp(min=1)[:, None] * step_dt)
 
 
 def score(results: dict[str, SkillResult]) -> float:

@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from kiras_rl.evaluation import (
+from kiras_rl.evaluation.flat import (
     Recording,
     SkillResult,
     as_scalars,
@@ -111,13 +111,27 @@ def test_a_robot_in_another_skill_s_keyframe_is_not_distinct(recording):
     assert (low.distinct, high.distinct) == (0.5, 1.0)
 
 
-def test_the_foot_that_lifts_least_counts():
+def test_lifts_are_counted_by_foot():
     contact = torch.ones(20, 1, 3, dtype=torch.bool)
     contact[1::4, :, 0] = False  # 5 lifts in 2 s
     contact[1::2, :, 1] = False
     contact[5:9, :, 2] = False  # one lift
-    assert lifts_per_second(contact, DT).tolist() == [0.5]
-    assert lifts_per_second(contact[..., :2], DT).tolist() == [2.5]
+    alive = torch.ones(20, 1, dtype=torch.bool)
+    assert lifts_per_second(contact, alive, DT).tolist() == [[2.5, 5.0, 0.5]]
+
+
+def test_a_fallen_robot_lifts_no_feet():
+    contact = torch.ones(20, 1, 1, dtype=torch.bool)
+    contact[1::4] = False  # steps 1 and 5, then after the fall 9, 13, 17
+    alive = (torch.arange(20) < 8)[:, None]
+    assert lifts_per_second(contact, alive, DT).item() == pytest.approx(2 / 0.8)
+    assert lifts_per_second(contact, alive & False, DT).tolist() == [[0.0]]
+
+
+def test_the_foot_that_lifts_least_counts(recording):
+    recording.contact[:, 2, 1] = True  # the others lift at steps 14, 18, 22 and 26 of 10 to 29
+    low, high = summarize(recording, KEYFRAMES).values()
+    assert (low.lifts, high.lifts) == pytest.approx((1.0, 2.0))
 
 
 def test_the_average_looks_back_four_tenths_of_a_second():

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from kiras_rl.transitions import evaluate_transitions, pairs_of, settle_times
+from kiras_rl.evaluation.transitions import evaluate_transitions, pairs_of, settle_times
 
 HEIGHTS = torch.tensor([0.2, 0.1, 0.3])
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import torch
 
-from kiras_rl.evaluation import SEED, Policy, moving_average
+from kiras_rl.evaluation.flat import SEED, Policy, moving_average
 from kiras_rl.interfaces import SkillEnv
 
 BEFORE = 2.0  # s of walking in the first skill

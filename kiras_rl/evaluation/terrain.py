@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import torch
 
-from kiras_rl.evaluation import SEED, Policy
+from kiras_rl.evaluation.flat import SEED, Policy
 from kiras_rl.interfaces import SkillEnv
 
 RADIUS = 3.0  # m from the middle of the tile, beyond all but the last obstacles: crossed

@@ -1,0 +1,1 @@
+"""What is measured of a policy, by protocol: without action noise, on robots from a fixed seed."""
