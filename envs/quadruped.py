@@ -92,7 +92,9 @@ class QuadrupedEnv(SkillEnv):
         cfg = self.cfg
         self._observer = Observer(cfg.observations, self._view())
         self.keyframe_features = self._features_of_keyframes()
-        self.feature_noise = self._observer.imitation.noise
+        phi = self._observer.imitation
+        self.imitation_terms = tuple(zip(phi.names, phi.sizes, phi.scales, strict=True))
+        self.feature_noise = phi.noise
         self._rewards = RewardSum(cfg.rewards, self.step_dt, self.device)
         generator = torch.Generator(device=self.device)
         generator.manual_seed(seed)
@@ -291,6 +293,14 @@ class QuadrupedEnv(SkillEnv):
             limb_contact=(robot.limb_force > CONTACT_FORCE).any(dim=1),
             distance=self._distance(),
             fallen=fallen,
+            # Copies: what a reset or a push does next is no part of the step.
+            base_pos_w=robot.base_pos_w.clone(),
+            base_quat_w=robot.base_quat_w.clone(),
+            gravity_b=robot.gravity_b,
+            ang_vel_b=robot.base_ang_vel_b.clone(),
+            joint_pos=robot.joint_pos.clone(),
+            joint_vel=robot.joint_vel.clone(),
+            joint_torque=robot.joint_torque.clone(),
         )
 
     def _log(

@@ -1,7 +1,7 @@
 """The contract between learning and simulation: every name that crosses it, with its shape.
 
 Letters: N worlds, P proprioceptive numbers, H frames of history, C critic numbers, D imitation
-features, S skills, F feet.
+features, S skills, F feet, J joints.
 """
 
 from __future__ import annotations
@@ -73,6 +73,13 @@ class Measurements:
         limb_contact: Worlds where a thigh or shank touched the ground, bool.
         distance: How far the base is from the middle of its tile, the larger of |x| and |y|, m.
         fallen: Worlds that terminate by failure at this step, bool.
+        base_pos_w: Base origin in the world, (N, 3), m.
+        base_quat_w: Base to world, (N, 4).
+        gravity_b: Unit vector of gravity in the base frame, (N, 3).
+        ang_vel_b: Base angular velocity in the base frame, (N, 3), rad/s.
+        joint_pos: (N, J), rad.
+        joint_vel: (N, J), rad/s.
+        joint_torque: (N, J), N m.
     """
 
     base_height: torch.Tensor
@@ -84,6 +91,13 @@ class Measurements:
     limb_contact: torch.Tensor
     distance: torch.Tensor
     fallen: torch.Tensor
+    base_pos_w: torch.Tensor
+    base_quat_w: torch.Tensor
+    gravity_b: torch.Tensor
+    ang_vel_b: torch.Tensor
+    joint_pos: torch.Tensor
+    joint_vel: torch.Tensor
+    joint_torque: torch.Tensor
 
 
 class SkillEnv(VecEnv):
@@ -101,6 +115,9 @@ class SkillEnv(VecEnv):
 
     keyframe_features: torch.Tensor
     """Phi of each skill's keyframe, (S, D)."""
+
+    imitation_terms: tuple[tuple[str, int, float], ...]
+    """Name, size and scale of each term of Phi, in their order."""
 
     feature_noise: torch.Tensor
     """Standard deviation of one unit of discriminator input noise in each feature, (D,)."""
