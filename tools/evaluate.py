@@ -14,7 +14,7 @@ from rich.console import Console
 from rich.table import Table
 
 from kiras_rl.checkpoint import CheckpointError
-from kiras_rl.config import ConfigError, config_from_dict, load_config
+from kiras_rl.config import ConfigError
 from kiras_rl.deploy.metadata import PolicyError
 from kiras_rl.envs.terrain_library import build_library
 from kiras_rl.evaluation import Policy, SkillResult, evaluate_skills
@@ -24,10 +24,12 @@ from kiras_rl.schema import Config
 from kiras_rl.terrain_evaluation import TIME_LIMIT, evaluate_terrain, rough_types
 from kiras_rl.tools.evaluator import (
     FLOOR,
+    evaluation_physics,
     make_evaluation_env,
     onboard_policy,
     results_table,
     terrain_table,
+    trained_config,
 )
 from kiras_rl.tools.policy_files import load_policy
 from kiras_rl.transitions import Transitions, evaluate_transitions
@@ -109,13 +111,8 @@ def evaluate(args: argparse.Namespace) -> dict:
     """Run the protocols, print tables and return all figures."""
     onboard = load_policy(args.policy, args.robot)
     metadata, policy = onboard.metadata, onboard_policy(onboard)
-    if "config" not in metadata.provenance:
-        raise ConfigError(
-            "this policy does not say how it was trained (provenance.config is missing): export it "
-            "from its run or checkpoint with kiras-export"
-        )
-    whole = config_from_dict(metadata.provenance["config"])
-    config = _physics(phase_config(whole, SKILL_LEARNING), args.nominal)
+    whole = trained_config(metadata)
+    config = evaluation_physics(phase_config(whole, SKILL_LEARNING), args.nominal)
     skills = len(metadata.skills)
     report: dict = {"provenance": metadata.provenance, "command": args.command}
     if args.protocol in ("all", "flat"):
@@ -128,7 +125,7 @@ def evaluate(args: argparse.Namespace) -> dict:
         report["transitions"] = _transitions(config, policy, skills, args)
     finetuned = metadata.provenance.get("iterations", 0) > whole.iterations
     if args.protocol == "terrain" or (args.protocol == "all" and finetuned):
-        rough = _physics(phase_config(whole, FINETUNING), args.nominal)
+        rough = evaluation_physics(phase_config(whole, FINETUNING), args.nominal)
         report["terrain"] = _terrain(rough, policy, args)
     return report
 
@@ -159,19 +156,6 @@ def _terrain(config: Config, policy: Policy, args: argparse.Namespace) -> dict:
             "strict": result.strict.tolist(),
         }
     return report
-
-
-def _physics(config: Config, nominal: bool) -> Config:
-    """Return the policy's configuration with the paper's randomization, or with none."""
-    paper = load_config("base").env
-    config.env.randomization = paper.randomization
-    config.env.observations.noise = not nominal
-    config.env.skills = paper.skills
-    if nominal:
-        for name, value in vars(config.env.randomization).items():
-            if name != "push_interval" and value is not None:
-                setattr(config.env.randomization, name, None)
-    return config
 
 
 def _verdict(results: dict[str, SkillResult]) -> None:
