@@ -17,6 +17,22 @@ from kiras_rl.envs.state import Keyframes, RobotState, Task
 
 SCAN_LIMIT = 1.0  # m
 
+UNITS = {
+    "pitch": "rad",
+    "roll_pitch": "rad",
+    "base_lin_vel": "m/s",
+    "base_ang_vel": "rad/s",
+    "command_lin_vel_x": "m/s",
+    "command_lin_vel_y": "m/s",
+    "command_ang_vel_z": "rad/s",
+    "joint_pos": "rad",
+    "joint_vel": "rad/s",
+    "foot_height": "m",
+    "base_height": "m",
+    "height_scan": "m",
+}
+"""Of the terms below, before their scale; what is not named has none."""
+
 
 @dataclass
 class View:

@@ -15,6 +15,7 @@ from kiras_rl.envs.curriculum import Curriculum
 from kiras_rl.envs.description import describe_deployment
 from kiras_rl.envs.ground import Ground
 from kiras_rl.envs.kinematics import FootKinematics
+from kiras_rl.envs.measuring import measure
 from kiras_rl.envs.model import build_scene
 from kiras_rl.envs.observations import View
 from kiras_rl.envs.observer import NOISE, Observer
@@ -23,7 +24,7 @@ from kiras_rl.envs.randomization import Randomizer
 from kiras_rl.envs.randomness import UniformBuffer
 from kiras_rl.envs.rewards import RewardSum
 from kiras_rl.envs.simulation.build import make_simulation
-from kiras_rl.envs.state import CONTACT_FORCE, Keyframes, RobotState, Step, Task
+from kiras_rl.envs.state import Keyframes, RobotState, Step, Task
 from kiras_rl.envs.terrain_library import build_library
 from kiras_rl.envs.terrains import CROSSED
 from kiras_rl.interfaces import Measurements, SkillEnv
@@ -99,8 +100,9 @@ class QuadrupedEnv(SkillEnv):
         self._observer = Observer(cfg.observations, self._view())
         skills = torch.arange(len(self.skills), device=self.device)
         at_rest = self._postures.at_rest(skills, torch.zeros(len(skills), 3, device=self.device))
-        self.keyframe_features = self._observer.imitation(at_rest)
-        self.feature_noise = self._observer.imitation.noise
+        phi = self._observer.imitation
+        self.keyframe_features, self.feature_noise = phi(at_rest), phi.noise
+        self.imitation_terms = tuple(zip(phi.names, phi.sizes, phi.scales, strict=True))
         self._rewards = RewardSum(cfg.rewards, self.step_dt, self.device)
         generator = torch.Generator(device=self.device)
         generator.manual_seed(seed)
@@ -160,7 +162,7 @@ class QuadrupedEnv(SkillEnv):
 
         invalid = self.sim.diverged | self.sim.overflowed
         fallen = self._fallen() | invalid
-        crossed = self._distance() > CROSSED
+        crossed = self._crossed()
         time_outs = ((self._length >= self.max_episode_length) | crossed) & ~fallen
         terms = self._judge(last_action, fallen, invalid)
         observer, view = self._observer, self._view()
@@ -172,7 +174,7 @@ class QuadrupedEnv(SkillEnv):
             names.NEXT_PROPRIO: _unless(invalid, observer.proprio(view), observer.clean),
             "log": self._log(terms, fallen, time_outs),
         }
-        self._measurements = self._measure(fallen)
+        self._measurements = measure(self.robot, self._distance(), fallen)
 
         done = fallen | time_outs
         if self._curriculum:
@@ -180,6 +182,10 @@ class QuadrupedEnv(SkillEnv):
             self._curriculum.update(done, fallen, crossed, self.task.skill)
         self._begin_next(done)
         return self._observe(done), terms.sum(dim=1), done, extras
+
+    def _crossed(self) -> torch.Tensor:
+        """Return which worlds have left their tile, (N,) bool; flat ground has no end."""
+        return (self._distance() > CROSSED) & (self._ground is not None)
 
     def _distance(self) -> torch.Tensor:
         """Return how far bases are from the middle of their tile, max(|x|, |y|), (N,), m."""
@@ -263,24 +269,6 @@ class QuadrupedEnv(SkillEnv):
 
     def _observe(self, begun: torch.Tensor) -> TensorDict:
         return self._observer.observe(self._view(), begun, self._random)
-
-    def _measure(self, fallen: torch.Tensor) -> Measurements:
-        robot = self.robot
-        return Measurements(
-            base_height=robot.base_height.clone(),
-            pitch=robot.roll_pitch[:, 1],
-            roll=robot.roll_pitch[:, 0],
-            lin_vel_h=robot.base_lin_vel_h,
-            yaw_rate=robot.yaw_rate,
-            gravity_b=robot.gravity_b,
-            joint_pos=robot.joint_pos.clone(),
-            joint_vel=robot.joint_vel.clone(),
-            joint_torque=robot.joint_torque.clone(),
-            foot_contact=robot.foot_contact,
-            limb_contact=(robot.limb_force > CONTACT_FORCE).any(dim=1),
-            distance=self._distance(),
-            fallen=fallen,
-        )
 
     def _log(
         self, terms: torch.Tensor, fallen: torch.Tensor, time_outs: torch.Tensor

@@ -64,10 +64,13 @@ class Measurements:
     """What an evaluation reads after a step, before automatic resets; shapes (N,) if not given.
 
     Attributes:
+        base_pos_w: Base origin in the world, (N, 3), m.
+        base_quat_w: Base to world, (N, 4).
         base_height: Base origin above the ground under the base, m.
         pitch: Nose down positive, rad.
         roll: rad.
         lin_vel_h: Base velocity in the heading frame, (N, 3), m/s.
+        ang_vel_b: Base angular velocity in the base frame, (N, 3), rad/s.
         yaw_rate: rad/s about the vertical.
         gravity_b: Unit vector of gravity in the base frame, (N, 3).
         joint_pos: (N, J), rad.
@@ -79,10 +82,13 @@ class Measurements:
         fallen: Worlds that terminate by failure at this step, bool.
     """
 
+    base_pos_w: torch.Tensor
+    base_quat_w: torch.Tensor
     base_height: torch.Tensor
     pitch: torch.Tensor
     roll: torch.Tensor
     lin_vel_h: torch.Tensor
+    ang_vel_b: torch.Tensor
     yaw_rate: torch.Tensor
     gravity_b: torch.Tensor
     joint_pos: torch.Tensor
@@ -109,6 +115,9 @@ class SkillEnv(VecEnv):
 
     keyframe_features: torch.Tensor
     """Phi of each skill's keyframe, (S, D)."""
+
+    imitation_terms: tuple[tuple[str, int, float], ...]
+    """Name, size and scale of each term of Phi, in their order."""
 
     feature_noise: torch.Tensor
     """Standard deviation of one unit of discriminator input noise in each feature, (D,)."""

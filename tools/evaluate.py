@@ -13,7 +13,7 @@ from pathlib import Path
 from rich.console import Console
 
 from kiras_rl.checkpoint import CheckpointError
-from kiras_rl.config import ConfigError, config_from_dict, load_config
+from kiras_rl.config import ConfigError
 from kiras_rl.deploy.metadata import PolicyError
 from kiras_rl.envs.terrain_library import build_library
 from kiras_rl.evaluation.flat import SETTLE, Policy, SkillResult, evaluate_skills
@@ -23,7 +23,13 @@ from kiras_rl.evaluation.transitions import evaluate_transitions
 from kiras_rl.phases import FINETUNING, SKILL_LEARNING, phase_config
 from kiras_rl.robots.robot import RobotError, load_robot
 from kiras_rl.schema import Config
-from kiras_rl.tools.evaluator import FLOOR, make_evaluation_env, onboard_policy
+from kiras_rl.tools.evaluator import (
+    FLOOR,
+    evaluation_physics,
+    make_evaluation_env,
+    onboard_policy,
+    trained_config,
+)
 from kiras_rl.tools.policy_files import load_policy
 from kiras_rl.tools.tables import (
     imitation_tables,
@@ -115,13 +121,8 @@ def evaluate(args: argparse.Namespace) -> dict:
     """Run the protocols, print tables and return all figures."""
     onboard = load_policy(args.policy, args.robot)
     metadata, policy = onboard.metadata, onboard_policy(onboard)
-    if "config" not in metadata.provenance:
-        raise ConfigError(
-            "this policy does not say how it was trained (provenance.config is missing): export it "
-            "from its run or checkpoint with kiras-export"
-        )
-    whole = config_from_dict(metadata.provenance["config"])
-    config = _physics(phase_config(whole, SKILL_LEARNING), args.nominal)
+    whole = trained_config(metadata)
+    config = evaluation_physics(phase_config(whole, SKILL_LEARNING), args.nominal)
     skills = len(metadata.skills)
     report: dict = {"provenance": metadata.provenance, "command": args.command}
     if args.protocol in ("all", "flat"):
@@ -136,7 +137,7 @@ def evaluate(args: argparse.Namespace) -> dict:
         report["transitions"] = _transitions(config, policy, skills, args)
     finetuned = metadata.provenance.get("iterations", 0) > whole.iterations
     if args.protocol == "terrain" or (args.protocol == "all" and finetuned):
-        rough = _physics(phase_config(whole, FINETUNING), args.nominal)
+        rough = evaluation_physics(phase_config(whole, FINETUNING), args.nominal)
         report["terrain"] = _terrain(rough, policy, args)
     return report
 
@@ -184,19 +185,6 @@ def _terrain(config: Config, policy: Policy, args: argparse.Namespace) -> dict:
             "strict": result.strict.tolist(),
         }
     return report
-
-
-def _physics(config: Config, nominal: bool) -> Config:
-    """Return the policy's configuration with the paper's randomization, or with none."""
-    paper = load_config("base").env
-    config.env.randomization = paper.randomization
-    config.env.observations.noise = not nominal
-    config.env.skills = paper.skills
-    if nominal:
-        for name, value in vars(config.env.randomization).items():
-            if name != "push_interval" and value is not None:
-                setattr(config.env.randomization, name, None)
-    return config
 
 
 def _verdict(results: dict[str, SkillResult]) -> None:

@@ -9,8 +9,8 @@ from collections.abc import Callable
 import torch
 from tensordict import TensorDict
 
-from kiras_rl.config import ConfigError
-from kiras_rl.deploy.policy import OnboardPolicy
+from kiras_rl.config import ConfigError, config_from_dict, list_configs, load_config
+from kiras_rl.deploy.policy import OnboardPolicy, PolicyMetadata
 from kiras_rl.envs import make_env
 from kiras_rl.envs.quadruped import QuadrupedEnv
 from kiras_rl.envs.terrain_library import build_library
@@ -29,6 +29,38 @@ from kiras_rl.schema import Config
 
 FLOOR = {"height": 0.03, "pitch": math.radians(5.0), "velocity": 0.12, "falls": 0.05}
 """What a skill must reach to be called learned: m, rad, m/s, share of robots."""
+
+
+def trained_config(metadata: PolicyMetadata) -> Config:
+    """Return the configuration that a policy was trained with.
+
+    Raises:
+        ConfigError: If the policy does not say it, or this version cannot read it.
+    """
+    if "config" not in metadata.provenance:
+        raise ConfigError(
+            "this policy does not say how it was trained (provenance.config is missing): export it "
+            "from its run or checkpoint with kiras-export"
+        )
+    return config_from_dict(metadata.provenance["config"])
+
+
+def evaluation_physics(config: Config, nominal: bool) -> Config:
+    """Return a policy's configuration with its robot's standard randomization, or with none.
+
+    Args:
+        config: Of one phase; it is changed.
+        nominal: No randomization, sensor noise or pushes.
+    """
+    standard = load_config(config.robot if config.robot in list_configs() else "base").env
+    config.env.randomization = standard.randomization
+    config.env.observations.noise = not nominal
+    config.env.skills = standard.skills
+    if nominal:
+        for name, value in vars(config.env.randomization).items():
+            if name != "push_interval" and value is not None:
+                setattr(config.env.randomization, name, None)
+    return config
 
 
 def make_evaluation_env(

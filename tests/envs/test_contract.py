@@ -69,6 +69,7 @@ def test_a_step_returns_what_was_promised(env, robot):
     for _ in range(20):
         obs, rewards, dones, extras = env.step(actions(env))
     assert env.num_actions == joints
+    assert sum(size for _, size, _ in env.imitation_terms) == env.keyframe_features.shape[1]
     proprio = obs[names.PROPRIO].shape[1]
     shapes = {name: tuple(group.shape) for name, group in obs.items()}
     assert shapes == {

@@ -1,0 +1,39 @@
+"""What evaluations read of a step."""
+
+from __future__ import annotations
+
+import torch
+
+from kiras_rl.envs.state import CONTACT_FORCE, RobotState
+from kiras_rl.interfaces import Measurements
+
+
+def measure(robot: RobotState, distance: torch.Tensor, fallen: torch.Tensor) -> Measurements:
+    """Collect the measurements of a step.
+
+    What lies in the simulation's own buffers is copied: what a reset or a push does next is no
+    part of the step.
+
+    Args:
+        robot: The robots after the step.
+        distance: From the middle of the tile, (N,), m.
+        fallen: Worlds that terminate by failure, (N,) bool.
+    """
+    return Measurements(
+        base_pos_w=robot.base_pos_w.clone(),
+        base_quat_w=robot.base_quat_w.clone(),
+        base_height=robot.base_height.clone(),
+        pitch=robot.roll_pitch[:, 1],
+        roll=robot.roll_pitch[:, 0],
+        lin_vel_h=robot.base_lin_vel_h,
+        ang_vel_b=robot.base_ang_vel_b.clone(),
+        yaw_rate=robot.yaw_rate,
+        gravity_b=robot.gravity_b,
+        joint_pos=robot.joint_pos.clone(),
+        joint_vel=robot.joint_vel.clone(),
+        joint_torque=robot.joint_torque.clone(),
+        foot_contact=robot.foot_contact,
+        limb_contact=(robot.limb_force > CONTACT_FORCE).any(dim=1),
+        distance=distance,
+        fallen=fallen,
+    )
