@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import datetime
 import logging
+import shlex
 import shutil
 import sys
 from pathlib import Path
@@ -13,6 +14,7 @@ from kiras_rl.checkpoint import FLAT, FOLDER, LATEST, find_checkpoint
 from kiras_rl.config import ConfigError, list_configs, load_config
 from kiras_rl.process import StopRequest
 from kiras_rl.runner import KirasRunner
+from kiras_rl.tools.sweep import list_sweeps, load_sweep, train_sweep
 from kiras_rl.tools.training import MISTAKES, begin, console, resume, train_run
 
 DESCRIPTION = """\
@@ -24,6 +26,9 @@ key can be set on the command line. Every key is explained in cfg/base.yaml.
 A run lives in runs/<configuration>/<time>/: config.yaml, checkpoints/, the TensorBoard log,
 policy.onnx and curves.png. Ctrl-C stops after the current iteration and saves; --resume goes on
 exactly where it stopped.
+
+A sweep is a file of cfg/sweeps/ or your own: configurations and seeds, trained one after the other
+in runs/sweeps/<name>/<label>/seed_<n>/. The same command goes on where it was interrupted.
 """
 
 EXAMPLES = """\
@@ -34,6 +39,8 @@ examples:
   kiras-train --cfg mine.yaml                         your own file, with "extends: solo8"
   kiras-train --resume runs/solo8/2026-01-31_12-00-00
   kiras-train --cfg solo8 --flat runs/solo8/2026-01-31_12-00-00   its skills, finetuned anew
+  kiras-train --sweep ablations                       KiRAS and its ablations, two seeds each
+  kiras-train --sweep mine.yaml num_envs=512          your own sweep, a key set in all its runs
   tensorboard --logdir runs
 """
 
@@ -44,7 +51,7 @@ def main(argv: list[str] | None = None) -> int:
     logging.basicConfig(format="%(message)s")
     logging.getLogger("kiras_rl").setLevel(logging.INFO)  # "kernels compile": minutes, once
     try:
-        return _train_one(args)
+        return _train_sweep(args) if args.sweep else _train_one(args)
     except MISTAKES as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
@@ -60,6 +67,7 @@ def _parse(argv: list[str] | None) -> argparse.Namespace:
     source = parser.add_mutually_exclusive_group(required=True)
     source.add_argument("--cfg", help=f"configuration; shipped: {', '.join(list_configs())}")
     source.add_argument("--resume", type=Path, help="run folder or checkpoint to go on with")
+    source.add_argument("--sweep", help=f"list of runs; shipped: {', '.join(list_sweeps())}")
     parser.add_argument(
         "--flat",
         type=Path,
@@ -112,6 +120,18 @@ def claim(folder: Path) -> Path:
         except FileExistsError:
             number += 1
             folder = folder.with_name(f"{name}.{number}")
+
+
+def _train_sweep(args: argparse.Namespace) -> int:
+    if args.flat is not None:
+        raise ConfigError("--flat begins a new run: give it with --cfg, not with --sweep")
+    report = train_sweep(load_sweep(args.sweep, args.overrides, args.runs))
+    console.print(report.table())
+    if report.stopped:
+        where = [] if args.runs == Path("runs") else ["--runs", str(args.runs)]
+        command = shlex.join(["kiras-train", "--sweep", args.sweep, *where, *args.overrides])
+        _say(f"stopped and saved; go on with: {command}")
+    return 1 if report.failures else 0
 
 
 def _say(message: str) -> None:

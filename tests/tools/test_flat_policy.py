@@ -112,7 +112,7 @@ def test_a_checkpoint_that_holds_no_flat_policy_is_refused(learned, tmp_path, ca
     assert not runs.exists()
 
 
-@pytest.mark.parametrize("option", ["--resume"])
+@pytest.mark.parametrize("option", ["--resume", "--sweep"])
 def test_it_goes_with_a_new_run_alone(option, capsys):
     message = refusal(capsys, option, "x", "--flat", "y")
     assert f"--flat begins a new run: give it with --cfg, not with {option}" in message
