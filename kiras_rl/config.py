@@ -17,14 +17,12 @@ from kiras_rl.schema import Config
 CFG_FOLDER = Path(__file__).resolve().parent / "cfg"
 if not CFG_FOLDER.is_dir():  # an editable install: kiras_rl.cfg is the top-level folder cfg/
     CFG_FOLDER = Path(__file__).resolve().parents[1] / "cfg"
+SWEEP_FOLDER = CFG_FOLDER / "sweeps"  # lists of runs, see kiras_rl.tools.sweep
 
-RESUME_OVERRIDES = (
-    "iterations",
-    "finetuning.iterations",
-    "device",
-    "sim.threads",
-    "checkpoint_minutes",
-)
+MACHINE_KEYS = ("device", "sim.threads", "checkpoint_minutes")
+"""Keys about the machine that trains: none of them makes a run another experiment."""
+
+RESUME_OVERRIDES = ("iterations", "finetuning.iterations", *MACHINE_KEYS)
 """Keys that may change when a run is resumed: none of them changes what was learned so far."""
 
 
@@ -98,8 +96,8 @@ def check_resume_overrides(overrides: list[str]) -> None:
 
 def list_configs() -> list[str]:
     """Return the names of the shipped configurations."""
-    names = (p.relative_to(CFG_FOLDER).with_suffix("") for p in CFG_FOLDER.rglob("*.yaml"))
-    return sorted(n.as_posix() for n in names)
+    files = (path for path in CFG_FOLDER.rglob("*.yaml") if path.parent != SWEEP_FOLDER)
+    return sorted(path.relative_to(CFG_FOLDER).with_suffix("").as_posix() for path in files)
 
 
 def _plain(value: Any) -> Any:

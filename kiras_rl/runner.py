@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -42,7 +43,7 @@ class Status:
         phase: Name of the phase, see kiras_rl.phases.
         iteration: Iterations done, over all phases.
         iterations: Iterations in all.
-        steps: Environment steps done.
+        steps: Environment steps done, over all phases.
         seconds: Wall time of this iteration.
         scalars: Everything that was logged for it.
         evaluation: The latest deterministic evaluation on flat ground, empty before the first.
@@ -114,7 +115,8 @@ class KirasRunner(OnPolicyRunner):
         self.terrain: TerrainResult | None = None
         self.best_score = float("inf")
         self.best_networks: dict | None = None
-        self.seconds = 0.0  # of training, over all resumes
+        self.seconds, self.steps = 0.0, 0  # of training, over all phases and resumes
+        self.begun_from: str | None = None  # another run's checkpoint that finetuning began with
         self._writer: SummaryWriter | None = None
         self._last_saved = time.monotonic()
 
@@ -125,6 +127,7 @@ class KirasRunner(OnPolicyRunner):
         num_learning_iterations: int | None = None,
         init_at_random_ep_len: bool = False,
         on_iteration: Callable[[Status], None] | None = None,
+        stop: StopRequest | None = None,
     ) -> bool:
         """Train until the phase is done or the process is asked to stop.
 
@@ -134,6 +137,7 @@ class KirasRunner(OnPolicyRunner):
             num_learning_iterations: At most this many now; None for all that remain.
             init_at_random_ep_len: Must be False: the environment spreads its episodes itself.
             on_iteration: Called after each iteration.
+            stop: An open request, of a caller who has to know of it; None for one of this call.
 
         Returns:
             Whether all iterations of the phase are done.
@@ -144,8 +148,8 @@ class KirasRunner(OnPolicyRunner):
         if num_learning_iterations is not None:
             last = min(last, self.current_learning_iteration + num_learning_iterations)
         self._open_log()
-        with StopRequest() as stop:
-            while self.current_learning_iteration < last and not stop.requested:
+        with nullcontext(stop) if stop else StopRequest() as request:
+            while self.current_learning_iteration < last and not request.requested:
                 status = self._iterate()
                 if on_iteration:
                     on_iteration(status)
@@ -167,6 +171,7 @@ class KirasRunner(OnPolicyRunner):
         learned = time.perf_counter()
         self.current_learning_iteration += 1
         steps = self.env.num_envs * self.cfg["num_steps_per_env"]
+        self.steps += steps
         physics = log.pop("Perf/physics_time")
         scalars |= {key: value.item() for key, value in log.items()} | {
             "Perf/physics_time": physics.item(),
@@ -183,7 +188,7 @@ class KirasRunner(OnPolicyRunner):
             phase=self.phase,
             iteration=self.current_learning_iteration,
             iterations=total_iterations(self.config),
-            steps=steps * self.current_learning_iteration,
+            steps=self.steps,
             seconds=seconds,
             scalars=scalars,
             evaluation=self.evaluation,
@@ -308,11 +313,11 @@ class KirasRunner(OnPolicyRunner):
 
     def describe_policy(self) -> dict:
         """Return the policy's metadata with where it comes from."""
-        steps = self.env.num_envs * self.cfg["num_steps_per_env"] * self.current_learning_iteration
         provenance = {
             "iterations": self.current_learning_iteration,
-            "steps": steps,
+            "steps": self.steps,
             "minutes": round(self.seconds / 60, 1),
+            "begun_from": self.begun_from,
             "commit": self.commit,
             "versions": checkpoint.versions(),
             "config": config_to_dict(self.config),
@@ -342,24 +347,23 @@ class KirasRunner(OnPolicyRunner):
         self.current_learning_iteration = content["iteration"]
         self.seconds, self.best_score = content["seconds"], content["best_score"]
         self.best_networks = content["best_networks"]
+        provenance = content["description"]["provenance"]
+        self.steps, self.begun_from = provenance["steps"], provenance.get("begun_from")
         set_generator_states(content["generators"])
         return content["infos"]
 
     def begin_from(self, path: Path) -> None:
-        """Begin this phase with the best networks of the one before.
+        """Begin this phase with the best networks in a checkpoint of the one before.
 
         Best by deterministic evaluation; those at the end where none was evaluated.
-
-        Args:
-            path: Checkpoint at the end of the phase before.
 
         Raises:
             CheckpointError: Unusable file, or one of other skills.
         """
         content = self._read(path)
-        learner = content["learner"]
-        self.alg.begin_from(content["best_networks"], learner)
+        self.alg.begin_from(content["best_networks"], content["learner"])
         self.seconds = content["seconds"]
+        self.steps = content["description"]["provenance"]["steps"]
         if self.alg.sampler:
             self.env.set_skill_probabilities(self.alg.sampler.probabilities)
 

@@ -22,6 +22,7 @@ from kiras_rl.envs.state import Step
 from kiras_rl.phases import FINETUNING, phase_config
 from kiras_rl.robots.robot import load_robot
 from kiras_rl.tools.curves import read_scalars
+from kiras_rl.tools.sweep import load_sweep
 from kiras_rl.tools.train import main as train
 
 ROOT = Path(__file__).parent.parent
@@ -169,9 +170,13 @@ def test_the_example_configurations_load(tmp_path):
     for example in examples:
         path = tmp_path / re.match(r"# (\w+\.yaml)", example)[1]
         path.write_text(example)
-        configs[path.stem] = load_config(str(path))
-    mine, steeper = configs.pop("mine"), configs.pop("steeper")
+        load = functools.partial(load_sweep, overrides=[], runs=tmp_path)
+        configs[path.stem] = (load if "\nseeds:" in example else load_config)(str(path))
+    mine, steeper, compare = (configs.pop(name) for name in ("mine", "steeper", "compare"))
     assert not configs
+    assert [run.name for run in compare[:4]] == [
+        *("kiras/seed_1", "uniform/seed_1", "steep/seed_1", "kiras/seed_2")
+    ]
     assert mine.env.rewards.terms["lin_vel_y"] is None
     assert mine.learner.skill_init is None
     assert phase_config(steeper, FINETUNING).env.terrain.scale == 1.5

@@ -25,7 +25,7 @@ from kiras_rl.tools import bench_environment as environment
 from kiras_rl.tools import bench_learning as learning
 from kiras_rl.tools.bench_inference import measure_inference
 from kiras_rl.tools.timing import Times, ratios, summarise
-from kiras_rl.tools.train import resolve_device
+from kiras_rl.tools.training import resolve_device
 
 DESCRIPTION = """\
 Measure how fast training is here and what each part of it costs. Absolute times depend on the

@@ -169,7 +169,7 @@ def test_the_command_line_is_checked_first(capsys):
     with pytest.raises(SystemExit) as caught:
         main([])
     assert caught.value.code == 2
-    assert "one of the arguments --cfg --resume is required" in capsys.readouterr().err
+    assert "one of the arguments --cfg --resume --sweep is required" in capsys.readouterr().err
 
 
 # --- a process of its own ------------------------------------------------------------------------

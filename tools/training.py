@@ -1,0 +1,260 @@
+"""One run: its learner, its two phases, and what it leaves behind."""
+
+from __future__ import annotations
+
+import subprocess
+from contextlib import suppress
+from pathlib import Path
+
+import torch
+from rich.console import Console
+
+from kiras_rl import checkpoint
+from kiras_rl.checkpoint import CheckpointError
+from kiras_rl.config import ConfigError, check_resume_overrides, config_from_dict, save_config
+from kiras_rl.deploy.policy import OnboardPolicy, PolicyError, PolicyMetadata
+from kiras_rl.envs import make_env, resolve_backend
+from kiras_rl.export import ExportError, export_policy
+from kiras_rl.phases import (
+    FINETUNING,
+    SKILL_LEARNING,
+    phase_config,
+    phases_of,
+)
+from kiras_rl.process import StopRequest
+from kiras_rl.robots.robot import RobotError
+from kiras_rl.runner import KirasRunner, TrainingError
+from kiras_rl.schema import Config
+from kiras_rl.tools.curves import draw_curves
+from kiras_rl.tools.evaluator import check_terrain, make_evaluators, onboard_policy
+from kiras_rl.tools.flat_policy import check_fit, read_flat
+from kiras_rl.tools.progress import Progress
+from kiras_rl.tools.tables import results_table, terrain_table
+
+MISTAKES = (CheckpointError, ConfigError, ExportError, PolicyError, RobotError, TrainingError)
+"""Errors whose message is all that a user needs."""
+
+CONFIG, POLICY = "config.yaml", "policy.onnx"
+"""Files of a run; the second one is the last that is written."""
+
+console = Console()
+
+
+# --- a learner -----------------------------------------------------------------------------------
+
+
+def begin(config: Config, flat: Path | None = None) -> KirasRunner:
+    """Return the learner of a new run, which has no folder yet.
+
+    Args:
+        config: The run.
+        flat: Checkpoint of an earlier skill learning, with whose best policy finetuning begins;
+            None to learn the skills first.
+
+    Raises:
+        CheckpointError: A checkpoint that does not fit.
+        ConfigError: What this phase or a later one could not use.
+    """
+    content = read_flat(flat, config) if flat else None
+    check(config)
+    runner = build(config, None, FINETUNING if flat else SKILL_LEARNING)
+    if flat and content:
+        check_fit(flat, content, runner)
+        runner.begin_from(flat)
+        runner.begun_from = str(flat)
+    return runner
+
+
+def resume(source: Path, overrides: list[str]) -> KirasRunner:
+    """Return the learner of a run that goes on from one of its checkpoints.
+
+    Args:
+        source: The checkpoint.
+        overrides: `key=value` strings for the keys that may change.
+
+    Raises:
+        CheckpointError: Unusable file, or one outside of a run.
+        ConfigError: A key that may not change.
+    """
+    check_resume_overrides(overrides)
+    run_dir, saved = _run_of(source), checkpoint.load_checkpoint(source)
+    config = config_from_dict(saved["config"], overrides)
+    check(config)
+    runner = build(config, run_dir, saved["phase"])
+    runner.load(str(source))
+    return runner
+
+
+def check(config: Config) -> None:
+    """Refuse now what a later phase could not use, not after hours of training.
+
+    Raises:
+        ConfigError: Terrain that cannot be.
+    """
+    if config.finetuning:
+        check_terrain(config)
+
+
+def _run_of(source: Path) -> Path:
+    if source.absolute().parent.name != checkpoint.FOLDER:
+        raise CheckpointError(
+            f"{source} lies in no run: give the run folder, or a file in its {checkpoint.FOLDER}/"
+        )
+    return source.absolute().parent.parent
+
+
+def build(
+    config: Config, run_dir: Path | None, phase: str, num_envs: int | None = None
+) -> KirasRunner:
+    """Build the learner of a phase with its environment and evaluations.
+
+    Args:
+        config: The run.
+        run_dir: Its folder.
+        phase: Which phase.
+        num_envs: Worlds, if not the configuration's.
+
+    Raises:
+        ConfigError: What the phase could not use.
+        PolicyError: A policy that could not be exported.
+    """
+    device = resolve_device(config.device)
+    env = make_env(phase_config(config, phase), device, num_envs)
+    evaluators = make_evaluators(config, phase, device)
+    runner = KirasRunner(env, config, run_dir, device, evaluators, _source_commit(), phase)
+    # What could not be exported is refused now, not after hours of training.
+    PolicyMetadata.from_dict(runner.describe_policy())
+    return runner
+
+
+def resolve_device(name: str) -> str:
+    """Return "cpu" or a CUDA device.
+
+    Raises:
+        ConfigError: CUDA asked for where there is none, or an unknown name.
+    """
+    if name == "auto":
+        return "cuda" if torch.cuda.is_available() else "cpu"
+    if name.split(":")[0] not in ("cpu", "cuda"):
+        raise ConfigError(f"device={name}: allowed are auto, cpu, cuda")
+    if name.startswith("cuda") and not torch.cuda.is_available():
+        raise ConfigError(f"device={name}: torch finds no CUDA device here; set device=cpu")
+    return name
+
+
+def _source_commit() -> str:
+    """Return the commit of the checkout that runs, or "unknown" for an installed package."""
+    folder = Path(__file__).resolve().parents[1]
+    command = ["git", "-C", str(folder), "describe", "--always", "--dirty", "--abbrev=12"]
+    try:
+        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+    except (OSError, subprocess.CalledProcessError):
+        return "unknown"
+
+
+# --- its training --------------------------------------------------------------------------------
+
+
+def train_run(runner: KirasRunner, stop: StopRequest) -> bool:
+    """Train a run in its folder, from where its learner stands to its end.
+
+    Args:
+        runner: What `begin` or `resume` returned, with a folder.
+        stop: Asked to, the training ends after its iteration, and is saved.
+
+    Returns:
+        Whether the run came to its end.
+    """
+    assert runner.run_dir is not None
+    runner.run_dir.mkdir(parents=True, exist_ok=True)
+    save_config(runner.config, runner.run_dir / CONFIG)
+    _announce(runner)
+    with Progress(console) as progress:
+        finished = runner.learn(on_iteration=progress.show, stop=stop)
+        if finished and runner.phase == SKILL_LEARNING and runner.config.finetuning:
+            runner = _next_phase(runner)
+            finished = runner.learn(on_iteration=progress.show, stop=stop)
+    if finished:
+        _conclude(runner)
+    return finished
+
+
+def is_finished(run_dir: Path, iterations: int) -> bool:
+    """Tell whether a run came to its end and all that it leaves behind is there.
+
+    Args:
+        run_dir: Its folder.
+        iterations: Of all its phases.
+
+    Raises:
+        CheckpointError: Its latest checkpoint is unusable.
+    """
+    latest = run_dir / checkpoint.FOLDER / checkpoint.LATEST
+    if not latest.is_file() or not (run_dir / POLICY).is_file():
+        return False
+    return checkpoint.load_checkpoint(latest)["iteration"] == iterations
+
+
+def _next_phase(before: KirasRunner) -> KirasRunner:
+    """Return the learner of terrain finetuning, which begins where skill learning ended.
+
+    The best policy of skill learning stays in the run under a name of its own.
+    """
+    assert before.run_dir is not None
+    folder = before.run_dir / checkpoint.FOLDER
+    runner = build(before.config, before.run_dir, FINETUNING)
+    runner.begin_from(folder / checkpoint.LATEST)
+    with suppress(FileNotFoundError):
+        (folder / checkpoint.BEST).replace(folder / checkpoint.FLAT)
+    return runner
+
+
+def _announce(runner: KirasRunner) -> None:
+    config = runner.config
+    backend = resolve_backend(config.sim.backend, torch.device(runner.device))
+    phases = (FINETUNING,) if runner.begun_from else phases_of(config)
+    lengths = [phase_config(config, phase).iterations for phase in phases]
+    steps = config.num_envs * config.learner.ppo.num_steps * sum(lengths)
+    console.print(
+        f"[bold]{config.robot}[/]: {_what_begins(runner)}, {', '.join(runner.env.skills)} | "
+        f"{config.num_envs} worlds, {backend} physics, {runner.device} | "
+        f"{' + '.join(map(str, lengths))} iterations, {steps / 1e6:.1f} M steps | "
+        f"{runner.run_dir}",
+        highlight=False,
+        soft_wrap=True,
+    )
+
+
+def _what_begins(runner: KirasRunner) -> str:
+    done = runner.current_learning_iteration
+    if done == 0:
+        return "training"
+    if runner.begun_from and done == runner.config.iterations:
+        return (
+            f"finetuning at iteration {done}, from {runner.begun_from} "
+            f"({runner.steps / 1e6:.1f} M steps of skill learning)"
+        )
+    return f"resuming at iteration {done}"
+
+
+def _conclude(runner: KirasRunner) -> None:
+    """Draw the curves, export the best policy, and say what there is and what to type next."""
+    run_dir = runner.run_dir
+    assert run_dir is not None
+    best = checkpoint.find_checkpoint(run_dir)
+    curves = draw_curves(run_dir)
+    onnx = export_policy(*checkpoint.load_policy(best), run_dir / POLICY).path
+    evaluators, policy = runner.evaluators, onboard_policy(OnboardPolicy(onnx))
+    if evaluators.flat:
+        results = evaluators.flat(policy)
+        console.print(results_table(results, "best policy, without action noise, v_x = 0.3 m/s"))
+    if evaluators.terrain:
+        console.print(terrain_table(evaluators.terrain(policy)))
+    console.print(
+        f"{runner.seconds / 60:.1f} min of training\n"
+        f"checkpoint  {best}\nONNX        {onnx}\ncurves      {curves}\n"
+        f"next:       kiras-play {run_dir} --trace trace.png\n"
+        f"            tensorboard --logdir {run_dir}",
+        highlight=False,
+        soft_wrap=True,
+    )
