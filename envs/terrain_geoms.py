@@ -80,7 +80,8 @@ def add_tile(spec: mujoco.MjSpec, library: TerrainLibrary, tile: int) -> None:
 def terrain_geoms(model: mujoco.MjModel, library: TerrainLibrary) -> TerrainGeoms:
     """Return the fields of every tile in a model to which `add_terrain` was applied."""
     boxes, has_ground = library.box_pos.shape[1], len(library.grids) > 1
-    first = model.geom("terrain/0" if boxes else "terrain/ground").id
+    names = ["terrain/0"] * (boxes > 0) + ["terrain/ground"] * has_ground
+    first = model.geom(names[0]).id if names else model.ngeom  # flat tiles alone need no geom
     tables = _box_fields(library)
     if has_ground:
         ground = _ground_fields(library)
