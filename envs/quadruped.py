@@ -328,9 +328,12 @@ class QuadrupedEnv(SkillEnv):
         self._read_begin()
         return self._observe(self._all)
 
-    def place(self, terrain: torch.Tensor, level: torch.Tensor) -> None:
-        """Choose the ground of every world; variants are dealt in turn."""
-        variant = torch.arange(self.num_envs, device=self.device) % self._library.variants
+    def place(
+        self, terrain: torch.Tensor, level: torch.Tensor, variant: torch.Tensor | None = None
+    ) -> None:
+        """Choose the ground of every world; variants are dealt in turn where none is given."""
+        if variant is None:
+            variant = torch.arange(self.num_envs, device=self.device) % self._library.variants
         self._placed = self._library.index(terrain, level, variant)
 
     def set_task(self, skill: torch.Tensor, command: torch.Tensor) -> TensorDict:

@@ -18,6 +18,7 @@ COLUMNS = {
     "action_delay": 1,
     "push": 2,
     "push_chance": 1,
+    "torque_factor": 1,
 }
 """Random numbers that this module takes each step."""
 
@@ -40,6 +41,7 @@ class Randomizer:
         self._mass, self._com = nominal("body_mass"), nominal("body_ipos")
         self._gain, self._bias = nominal("actuator_gainprm"), nominal("actuator_biasprm")
         self._delay = nominal("actuator_delay")
+        self._limits = nominal("actuator_forcerange")
 
     def reset(self, mask: torch.Tensor) -> None:
         """Draw the physics of the masked worlds, (N,) bool."""
@@ -50,6 +52,9 @@ class Randomizer:
             self._write_base(mask)
         if config.kp_factor or config.kd_factor:
             self._write_gains(mask)
+        if config.torque_factor:
+            factor = self._draw("torque_factor", config.torque_factor)
+            self._sim.write_field("actuator_forcerange", mask, self._limits * factor[:, None])
         if config.action_delay:
             self._write_delay(mask, config.action_delay)
 

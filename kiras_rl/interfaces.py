@@ -161,12 +161,15 @@ class SkillEnv(VecEnv):
         """
 
     @abstractmethod
-    def place(self, terrain: torch.Tensor, level: torch.Tensor) -> None:
+    def place(
+        self, terrain: torch.Tensor, level: torch.Tensor, variant: torch.Tensor | None = None
+    ) -> None:
         """Choose the ground of every world, from its next reset on and for good.
 
         Args:
             terrain: Index into `terrains`, (N,).
             level: Difficulty level, (N,).
+            variant: Of the tile, (N,); None deals the variants to the worlds in turn.
         """
 
     @abstractmethod

@@ -86,6 +86,7 @@ class RandomizationConfig:
     com_shift: tuple[float, float] | None
     kp_factor: tuple[float, float] | None
     kd_factor: tuple[float, float] | None
+    torque_factor: tuple[float, float] | None
     action_delay: tuple[int, int] | None
     push_velocity: tuple[float, float] | None
     push_interval: float

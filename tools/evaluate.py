@@ -3,77 +3,52 @@
 from __future__ import annotations
 
 import argparse
-import copy
-import json
-import math
 import sys
-from dataclasses import asdict
 from pathlib import Path
 
 from rich.console import Console
+from rich.progress import Progress
 
 from kiras_rl.checkpoint import CheckpointError
 from kiras_rl.config import ConfigError
 from kiras_rl.deploy.metadata import PolicyError
-from kiras_rl.envs.terrain_library import build_library
-from kiras_rl.evaluation.flat import SETTLE, Policy, SkillResult, evaluate_skills
-from kiras_rl.evaluation.imitation import STEPS, evaluate_imitation
-from kiras_rl.evaluation.terrain import TIME_LIMIT, evaluate_terrain, rough_types
-from kiras_rl.evaluation.transitions import evaluate_transitions
-from kiras_rl.phases import FINETUNING, SKILL_LEARNING, phase_config
-from kiras_rl.robots.robot import RobotError, load_robot
-from kiras_rl.schema import Config
-from kiras_rl.tools.evaluator import (
-    FLOOR,
-    evaluation_physics,
-    make_evaluation_env,
-    onboard_policy,
-    trained_config,
-)
-from kiras_rl.tools.policy_files import load_policy
-from kiras_rl.tools.tables import (
-    imitation_tables,
-    results_table,
-    terrain_table,
-    transitions_table,
-)
+from kiras_rl.robots.robot import RobotError
+from kiras_rl.tools.protocols import PROTOCOLS
+from kiras_rl.tools.protocols.sampling import run_of
+from kiras_rl.tools.protocols.subject import Options, Subject
+from kiras_rl.tools.protocols.terrain import LEVELS
+from kiras_rl.tools.report.about import about_table
+from kiras_rl.tools.report.content import Section
+from kiras_rl.tools.report.files import write_report
+from kiras_rl.tools.report.terminal import as_rich
+from kiras_rl.tools.training import resolve_device
 
 DESCRIPTION = """\
-Measure a policy without action noise, on robots drawn by the paper's domain randomization, with
-sensor noise, actuation delay and pushes.
+Measure a policy without action noise, through the code that runs on the robot, on robots drawn by
+their domain randomization, with sensor noise, actuation delay and pushes.
 
-Without --protocol: flat, imitation, transitions and, for a policy that was finetuned, terrain.
+Tables are printed; a folder gets report.html, which opens offline, tables/*.csv and results.json.
+That folder is evaluation/ of a run, or evaluation/<policy>/. An interrupted evaluation goes on
+where it was when the same command is given again.
 
-flat         every skill walks straight ahead for 20 s; height and pitch errors are those of a 0.4 s
-             moving average after the first second, the velocity error is that of each step
-imitation    every skill walks straight ahead, without pushes; of the 120 steps after the first
-             second: distance (dynamic time warping) and cosine to the keyframe, errors of height
-             and pitch, the nearest keyframe; foot clearance, stepping, torques, power
-transitions  every ordered pair of skills, switched while walking: falls, and time until the moving
-             averages of height (1.5 cm) and pitch (3 degrees) stay at the new keyframe for 0.3 s;
-             a robot that was not in the first skill before the switch counts as not settled
-terrain      every skill crosses every rough terrain type at several levels of difficulty, 0 the
-             lowest and 10 the top: from the middle of a tile, with any heading, which is held, at
-             0.2 to 0.6 m/s, 3 m far within twice the time of the way and 20 s, without a fall;
-             strictly, if thighs and shanks touch the ground in at most 5 % of the steps
+Without --protocol: flat, imitation, transitions, for a run sampling, and for a policy that was
+finetuned terrain.
+
 """
 
 EXAMPLES = """\
 examples:
   kiras-evaluate                              the policy shipped with Solo-8
   kiras-evaluate runs/solo8_quick/2026-01-31_12-00-00
-  kiras-evaluate policy.onnx --protocol imitation --json imitation.json
-  kiras-evaluate policy.onnx --protocol transitions --trials 50 --json transitions.json
+  kiras-evaluate policy.onnx --protocol imitation,transitions
   kiras-evaluate policy.onnx --protocol terrain --levels 4,5 --trials 100
+  kiras-evaluate policy.onnx --protocol heat_map   an hour or two on two CPU cores
 """
 
-PROTOCOLS = ("all", "flat", "imitation", "transitions", "terrain")
+MISTAKES = (CheckpointError, ConfigError, PolicyError, RobotError)
+"""Errors whose message is all that a user needs."""
 
-LEVELS = 11
-"""Of the terrain protocol, whatever the training had: steps of a tenth from lowest to top."""
-
-SPEEDS = (0.2, 0.6)
-"""Commanded v_x of the terrain protocol, m/s."""
+ALL = list(PROTOCOLS)
 
 console = Console()
 
@@ -82,75 +57,108 @@ def main(argv: list[str] | None = None) -> int:
     """Run the command; return its exit code."""
     args = _parse(argv)
     try:
-        report = evaluate(args)
-    except (ConfigError, CheckpointError, PolicyError, RobotError) as error:
+        subject = Subject.load(args.policy, args.robot, args.out, options_of(args))
+        names = args.protocol or default_protocols(subject)
+        if names == ALL and run_of(subject.source) is None:
+            names = [name for name in names if name != "sampling"]  # which only a run can tell
+        evaluate(subject, names)
+    except MISTAKES as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
-    if args.json:
-        args.json.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
+    except KeyboardInterrupt:
+        print("stopped; the same command goes on from here", file=sys.stderr)
+        return 130
     return 0
 
 
+def evaluate(subject: Subject, names: list[str]) -> Path:
+    """Run protocols, print their tables and write the report after each; return its page."""
+    sections: list[Section] = []
+    page = subject.folder
+    for name, values in measure([subject], names):
+        section = PROTOCOLS[name].section({subject.label: values[0]})
+        sections.append(section.of_one_policy())
+        for table in sections[-1].tables:
+            console.print(as_rich(table))
+        title = f"KiRAS: {subject.label}"
+        page = write_report(subject.folder, title, about_table([subject]), sections)
+    console.print(f"report: {page}", highlight=False, soft_wrap=True)
+    return page
+
+
+def measure(subjects: list[Subject], names: list[str]):  # noqa: ANN201
+    """Yield the name of each protocol and its values for every subject, under a progress bar."""
+    with Progress(console=console, transient=True) as progress:
+        task = progress.add_task("", total=len(names) * len(subjects))
+        for name in names:
+            values = []
+            for subject in subjects:
+                progress.update(task, description=f"{name}: {subject.label}")
+                values.append(PROTOCOLS[name].measure(subject))
+                progress.advance(task)
+            yield name, values
+
+
+def default_protocols(subject: Subject) -> list[str]:
+    """Return what is measured of a policy where the user names nothing."""
+    names = ["flat", "imitation", "transitions"]
+    if subject.is_finetuned:
+        names.append("terrain")
+    return names + (["sampling"] if run_of(subject.source) else [])
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Add what kiras-evaluate and kiras-compare have in common."""
+    parser.add_argument(
+        "--protocol", type=_protocols, help=f"all, or some of {','.join(PROTOCOLS)}"
+    )
+    default = Options()
+    parser.add_argument(
+        "--robots", type=_count, default=default.robots,
+        help="robots a skill (flat, imitation, robustness)",
+    )  # fmt: skip
+    parser.add_argument("--duration", type=float, default=default.duration, help="s a robot (flat)")
+    parser.add_argument("--trials", type=_count, help="of a cell (the others)")
+    parser.add_argument(
+        "--levels", type=_levels, default=default.levels, help="of terrain, 0 to 10, as in 2,4,6"
+    )
+    parser.add_argument("--command", type=float, default=default.command, help="v_x, m/s")
+    parser.add_argument("--nominal", action="store_true", help="no randomization, noise or pushes")
+    parser.add_argument("--backend", choices=("auto", "native", "warp"), default="auto")
+    parser.add_argument("--device", default="cpu", help="of the simulation: cpu or cuda")
+    parser.add_argument("--out", type=Path, help="folder of the report")
+
+
+def options_of(args: argparse.Namespace) -> Options:
+    """Return the options that `add_options` parsed."""
+    given = {name: getattr(args, name) for name in Options.__dataclass_fields__}
+    return Options(**given | {"device": resolve_device(args.device)})
+
+
 def _parse(argv: list[str] | None) -> argparse.Namespace:
+    protocols = "\n".join(f"{name:<12} {p.TITLE.lower()}" for name, p in PROTOCOLS.items())
     parser = argparse.ArgumentParser(
         prog="kiras-evaluate",
-        description=DESCRIPTION,
+        description=DESCRIPTION + protocols,
         epilog=EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("policy", nargs="?", type=Path, help="run folder, checkpoint or ONNX file")
     parser.add_argument("--robot", help="whose shipped policy, if none is given (solo8)")
-    parser.add_argument("--protocol", choices=PROTOCOLS, default="all")
-    parser.add_argument(
-        "--robots", type=_count, default=100, help="robots a skill (flat, imitation)"
-    )
-    parser.add_argument("--duration", type=float, default=20.0, help="s a robot (flat)")
-    parser.add_argument(
-        "--trials", type=_count, default=50, help="of a pair (transitions), or of a cell (terrain)"
-    )
-    parser.add_argument(
-        "--levels", type=_levels, default="0,2,4,6,8,10", help="of terrain, 0 to 10"
-    )
-    parser.add_argument("--command", type=float, default=0.3, help="v_x, m/s")
-    parser.add_argument("--nominal", action="store_true", help="no randomization, noise or pushes")
-    parser.add_argument("--json", type=Path, help="also write the figures to this file")
+    add_options(parser)
     return parser.parse_args(argv)
 
 
-def evaluate(args: argparse.Namespace) -> dict:
-    """Run the protocols, print tables and return all figures."""
-    onboard = load_policy(args.policy, args.robot)
-    metadata, policy = onboard.metadata, onboard_policy(onboard)
-    whole = trained_config(metadata)
-    config = evaluation_physics(phase_config(whole, SKILL_LEARNING), args.nominal)
-    skills = len(metadata.skills)
-    report: dict = {"provenance": metadata.provenance, "command": args.command}
-    if args.protocol in ("all", "flat"):
-        env = make_evaluation_env(config, args.robots * skills, args.duration)
-        results = evaluate_skills(env, policy, args.duration, args.command)
-        console.print(results_table(results, f"flat: {args.robots} robots a skill"))
-        report["flat"] = {name: asdict(result) for name, result in results.items()}
-        _verdict(results)
-    if args.protocol in ("all", "imitation"):
-        report["imitation"] = _imitation(config, policy, skills, args)
-    if args.protocol in ("all", "transitions"):
-        report["transitions"] = _transitions(config, policy, skills, args)
-    finetuned = metadata.provenance.get("iterations", 0) > whole.iterations
-    if args.protocol == "terrain" or (args.protocol == "all" and finetuned):
-        rough = evaluation_physics(phase_config(whole, FINETUNING), args.nominal)
-        report["terrain"] = _terrain(rough, policy, args)
-    return report
-
-
-def _imitation(config: Config, policy: Policy, skills: int, args: argparse.Namespace) -> dict:
-    config = copy.deepcopy(config)
-    config.env.randomization.push_velocity = None
-    duration = SETTLE + STEPS * config.sim.timestep * config.sim.substeps
-    env = make_evaluation_env(config, args.robots * skills, duration)
-    result = evaluate_imitation(env, policy, args.command)
-    for table in imitation_tables(result, args.robots):
-        console.print(table)
-    return result.as_dict()
+def _protocols(text: str) -> list[str]:
+    if text == "all":
+        return ALL
+    names = text.split(",")
+    unknown = [name for name in names if name not in PROTOCOLS]
+    if unknown:
+        raise argparse.ArgumentTypeError(
+            f"unknown protocol '{unknown[0]}'; allowed are all, {', '.join(PROTOCOLS)}"
+        )
+    return names
 
 
 def _count(text: str) -> int:
@@ -159,55 +167,11 @@ def _count(text: str) -> int:
     return int(text)
 
 
-def _levels(text: str) -> list[int]:
-    levels = [int(part) for part in text.split(",") if part.isdigit()]
+def _levels(text: str) -> tuple[int, ...]:
+    levels = tuple(int(part) for part in text.split(",") if part.isdigit())
     if len(levels) != text.count(",") + 1 or max(levels) >= LEVELS:
         raise argparse.ArgumentTypeError(f"'{text}': give levels from 0 to {LEVELS - 1}, as in 4,5")
     return levels
-
-
-def _terrain(config: Config, policy: Policy, args: argparse.Namespace) -> dict:
-    """Try every skill on every rough type at every level, one level after the other."""
-    if config.env.terrain is None:
-        raise ConfigError("this policy's configuration has no terrain: finetuning=null in its run")
-    config.env.terrain.levels = LEVELS
-    skills = load_robot(config.robot).skills
-    count = len(rough_types(build_library(config.env.terrain).types))
-    env = make_evaluation_env(config, args.trials * count * len(skills), TIME_LIMIT)
-    report = {}
-    for level in args.levels:
-        result = evaluate_terrain(env, policy, args.trials, level, SPEEDS)
-        console.print(terrain_table(result))
-        report[str(level)] = {
-            "terrains": result.terrains,
-            "skills": result.skills,
-            "success": result.success.tolist(),
-            "strict": result.strict.tolist(),
-        }
-    return report
-
-
-def _verdict(results: dict[str, SkillResult]) -> None:
-    target = {"height": 0.01, "pitch": math.radians(2.0), "velocity": 0.08, "falls": 0.0}
-    for name, limits in (("floor", FLOOR), ("target", target)):
-        met = [skill for skill, result in results.items() if result.meets(**limits)]
-        console.print(f"{name}: {len(met)} of {len(results)} skills ({', '.join(met) or 'none'})")
-
-
-def _transitions(config: Config, policy: Policy, skills: int, args: argparse.Namespace) -> dict:
-    worlds = skills * (skills - 1) * args.trials
-    env = make_evaluation_env(config, worlds, 10.0)
-    result = evaluate_transitions(env, policy, args.trials, args.command)
-    console.print(transitions_table(result, env.skills))
-    fell, settled = result.overall()
-    console.print(f"falls {100 * fell:.1f} %, settled within 2 s {100 * settled:.1f} %")
-    return {
-        "skills": list(env.skills),
-        "fell": result.fell.nan_to_num().tolist(),
-        "settled": result.settled.nan_to_num().tolist(),
-        "settle_time": result.settle_time.nan_to_num().tolist(),
-        "overall": {"fell": fell, "settled": settled},
-    }
 
 
 if __name__ == "__main__":

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 from contextlib import suppress
+from dataclasses import asdict
 from pathlib import Path
 
 import torch
@@ -29,7 +30,8 @@ from kiras_rl.tools.curves import draw_curves
 from kiras_rl.tools.evaluator import check_terrain, make_evaluators, onboard_policy
 from kiras_rl.tools.flat_policy import check_fit, read_flat
 from kiras_rl.tools.progress import Progress
-from kiras_rl.tools.tables import results_table, terrain_table
+from kiras_rl.tools.protocols import flat, terrain
+from kiras_rl.tools.report.terminal import as_rich
 
 MISTAKES = (CheckpointError, ConfigError, ExportError, PolicyError, RobotError, TrainingError)
 """Errors whose message is all that a user needs."""
@@ -246,10 +248,10 @@ def _conclude(runner: KirasRunner) -> None:
     onnx = export_policy(*checkpoint.load_policy(best), run_dir / POLICY).path
     evaluators, policy = runner.evaluators, onboard_policy(OnboardPolicy(onnx))
     if evaluators.flat:
-        results = evaluators.flat(policy)
-        console.print(results_table(results, "best policy, without action noise, v_x = 0.3 m/s"))
+        results = {name: asdict(result) for name, result in evaluators.flat(policy).items()}
+        console.print(as_rich(flat.table({run_dir.name: results}, "Best policy, flat ground")))
     if evaluators.terrain:
-        console.print(terrain_table(evaluators.terrain(policy)))
+        console.print(as_rich(terrain.result_table(evaluators.terrain(policy))))
     console.print(
         f"{runner.seconds / 60:.1f} min of training\n"
         f"checkpoint  {best}\nONNX        {onnx}\ncurves      {curves}\n"

@@ -20,6 +20,7 @@ RANDOMISED_FIELDS = (
     "actuator_gainprm",
     "actuator_biasprm",
     "actuator_delay",
+    "actuator_forcerange",
 )
 """Fields of MjModel that hold one value a world."""
 

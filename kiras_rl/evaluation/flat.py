@@ -128,6 +128,16 @@ def deal_skills(env: SkillEnv, command: float) -> tuple[torch.Tensor, torch.Tens
 
 def summarize(recording: Recording, env: SkillEnv) -> dict[str, SkillResult]:
     """Reduce a recording to one result a skill; a robot counts until it falls."""
+    values = per_robot(recording, env)
+    results = {}
+    for index, name in enumerate(env.skills):
+        mine = recording.skill == index
+        results[name] = SkillResult(**{key: x[mine].mean().item() for key, x in values.items()})
+    return results
+
+
+def per_robot(recording: Recording, env: SkillEnv) -> dict[str, torch.Tensor]:
+    """Return the fields of SkillResult for each robot, (N,) each."""
     target_height = env.keyframe_height[recording.skill]
     target_pitch = env.keyframe_pitch[recording.skill]
     start = round(SETTLE / recording.step_dt)
@@ -135,7 +145,7 @@ def summarize(recording: Recording, env: SkillEnv) -> dict[str, SkillResult]:
     height = moving_average(recording.height, recording.step_dt)[start:]
     pitch = moving_average(recording.pitch, recording.step_dt)[start:]
     velocity = recording.velocity[start:]
-    per_robot = {
+    values = {
         "height": _mean(recording.height[start:], alive),
         "pitch": _mean(recording.pitch[start:], alive),
         "velocity": _mean(velocity, alive),
@@ -147,13 +157,7 @@ def summarize(recording: Recording, env: SkillEnv) -> dict[str, SkillResult]:
         ).amin(dim=-1),
         "falls": 1.0 - recording.alive[-1].float(),
     }
-    per_robot["distinct"] = _distinct(per_robot["height"], per_robot["pitch"], recording, env)
-    results = {}
-    for index, name in enumerate(env.skills):
-        mine = recording.skill == index
-        values = {key: value[mine].mean().item() for key, value in per_robot.items()}
-        results[name] = SkillResult(**values)
-    return results
+    return values | {"distinct": _distinct(values["height"], values["pitch"], recording, env)}
 
 
 def moving_average(signal: torch.Tensor, step_dt: float) -> torch.Tensor:

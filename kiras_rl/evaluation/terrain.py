@@ -25,12 +25,14 @@ class Trials:
         level: Difficulty level.
         skill: Index of the skill.
         speed: Commanded v_x, m/s; the heading of the start is held.
+        variant: Of the tile; None deals the variants to the worlds in turn.
     """
 
     terrain: torch.Tensor
     level: torch.Tensor
     skill: torch.Tensor
     speed: torch.Tensor
+    variant: torch.Tensor | None = None
 
 
 @dataclass(frozen=True)
@@ -49,18 +51,19 @@ class Outcomes:
 
 
 @torch.no_grad()
-def run_trials(env: SkillEnv, policy: Policy, trials: Trials) -> Outcomes:
+def run_trials(env: SkillEnv, policy: Policy, trials: Trials, seed: int = SEED) -> Outcomes:
     """Start every robot in the middle of its tile, in its skill's keyframe, with any heading.
 
     Args:
         env: With one world a trial.
         policy: Observation -> mean actions.
         trials: What to try.
+        seed: Of robots and headings.
     """
     command = torch.zeros(env.num_envs, 3, device=env.device)
     command[:, 0] = trials.speed
-    env.seed(SEED)
-    env.place(trials.terrain, trials.level)
+    env.seed(seed)
+    env.place(trials.terrain, trials.level, trials.variant)
     obs = env.reset(trials.skill, command, hold_heading=True)
     limit = (PATIENCE * RADIUS / trials.speed).clamp(max=TIME_LIMIT) / env.step_dt
     success = torch.zeros(env.num_envs, dtype=torch.bool, device=env.device)

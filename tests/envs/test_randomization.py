@@ -125,6 +125,13 @@ def test_stiffer_springs_pull_harder(build):
     torch.testing.assert_close(stiff, torch.full((8, 8), 0.6))
 
 
+def test_weaker_motors_give_less_torque(build):
+    # The target is 4 rad away: 20 N m are asked for, 2.5 N m is the limit.
+    torch.testing.assert_close(first_torque(build(), 8.0).amax(), torch.tensor(2.5))
+    weak = first_torque(build(torque_factor="[0.4,0.4]"), 8.0)
+    torch.testing.assert_close(weak.amax(), torch.tensor(1.0))
+
+
 def test_stronger_dampers_brake_harder(build):
     for factor, torque in (("null", -0.2), ("[0.8,0.8]", -0.16)):
         env = build(kd_factor=factor)

@@ -1,22 +1,33 @@
-"""kiras-evaluate on the policy that comes with Solo-8, with few robots."""
+"""kiras-evaluate and kiras-compare on the policy that comes with Solo-8, with few robots."""
 
 from __future__ import annotations
 
 import json
+import shutil
 
 import pytest
 
+from kiras_rl.tools import compare
 from kiras_rl.tools.evaluate import main
+from kiras_rl.tools.policy_files import shipped_policy
+
+SKILLS = ["walk", "crawl", "stilt", "pitch_up", "pitch_down"]
+FEW = ["--robots", "2", "--trials", "1", "--duration", "2"]
+
+
+def results(folder, protocol):
+    """Return the results of a protocol by key."""
+    content = json.loads((folder / "results.json").read_text())["results"]
+    return {key: value for key, value in content.items() if key.startswith(protocol)}
 
 
 def test_the_imitation_protocol_measures_the_shipped_policy(tmp_path, capsys):
-    path = tmp_path / "imitation.json"
-    assert main(["--protocol", "imitation", "--robots", "2", "--json", str(path)]) == 0
+    assert main(["--protocol", "imitation", "--robots", "2", "--out", str(tmp_path)]) == 0
     printed = capsys.readouterr().out
-    for title in ("imitation: 2 robots a skill, 120 steps", "gait", "nearest keyframe"):
+    for title in ("Distance to the keyframes", "Gait", "Nearest keyframe", "report.html"):
         assert title in printed
-    imitation = json.loads(path.read_text())["imitation"]
-    assert list(imitation["skills"]) == ["walk", "crawl", "stilt", "pitch_up", "pitch_down"]
+    (imitation,) = results(tmp_path, "imitation").values()
+    assert list(imitation["skills"]) == SKILLS
     for result in imitation["skills"].values():
         assert result["falls"] == 0.0
         assert result["dtw"] == pytest.approx(120 * result["dtw_frame"])
@@ -28,6 +39,55 @@ def test_the_imitation_protocol_measures_the_shipped_policy(tmp_path, capsys):
         assert 1.0 < result["power"] < 15.0
 
 
+def test_terrain_is_crossed_level_by_level_and_gives_the_same_numbers_again(tmp_path, capsys):
+    command = ["--protocol", "terrain", "--levels", "0,1", "--trials", "1"]
+    assert main([*command, "--out", str(tmp_path / "a")]) == 0
+    assert "Level 0" in capsys.readouterr().out
+    found = results(tmp_path / "a", "terrain")
+    assert len(found) == 2
+    for types in found.values():
+        assert list(types) == ["slopes", "bars", "footholds", "stairs"]
+        for cells in types.values():
+            assert list(cells) == SKILLS
+            assert all(0 <= c["strict"] <= c["success"] <= c["trials"] == 1 for c in cells.values())
+    level_ground = next(types for key, types in found.items() if "level=0" in key)["slopes"]
+    assert sum(c["success"] for c in level_ground.values()) >= 4
+    # One level by itself is what it was among others.
+    assert main([*command[:2], "--levels", "1", *command[4:], "--out", str(tmp_path / "b")]) == 0
+    again = results(tmp_path / "b", "terrain")
+    assert again == {key: found[key] for key in again}
+
+
+def test_transitions_are_measured_on_both_grounds(tmp_path):
+    assert main(["--protocol", "transitions", "--trials", "1", "--out", str(tmp_path)]) == 0
+    found = results(tmp_path, "transitions")
+    assert len(found) == 3
+    flat = next(value for key, value in found.items() if "/flat" in key)
+    assert flat["settled"][0][1] == 1.0 and flat["settled"][0][0] is None
+    trace = next(value for key, value in found.items() if "/trace" in key)
+    assert trace["order"] == [*SKILLS, "walk"]
+    assert trace["height"]["mean"][140] == pytest.approx(0.2, abs=0.02)  # of walking, at 2.8 s
+    assert trace["height"]["mean"][290] == pytest.approx(0.1, abs=0.02)  # of crawling
+
+
+def test_policies_are_set_side_by_side_and_seeds_pooled(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for seed in (1, 2):
+        (tmp_path / f"ours/seed_{seed}").mkdir(parents=True)
+        shutil.copy(shipped_policy("solo8"), tmp_path / f"ours/seed_{seed}/policy.onnx")
+    shutil.copy(shipped_policy("solo8"), tmp_path / "one.onnx")
+    code = compare.main(["ours", "theirs=one.onnx", "--protocol", "flat", *FEW, "--out", "page"])
+    assert code == 0
+    page = (tmp_path / "page/report.html").read_text()
+    rows = (tmp_path / "page/tables/flat_skills_on_flat_ground.csv").read_text().splitlines()
+    assert rows[1].startswith("walk,ours,") and rows[2].startswith("walk,theirs,")
+    assert rows[1].split(",")[2:-1] == rows[2].split(",")[2:-1]  # the same policy three times
+    assert "KiRAS: ours / theirs" in page
+    assert (tmp_path / "ours/seed_1/evaluation/results.json").is_file()
+    assert compare.main(["x=one.onnx", "x=one.onnx"]) == 2
+    assert "two policies are called 'x'" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("option", ["--robots", "--trials"])
 @pytest.mark.parametrize("value", ["0", "-3", "many"])
 def test_a_number_that_cannot_be_is_refused(option, value, capsys):
@@ -35,3 +95,18 @@ def test_a_number_that_cannot_be_is_refused(option, value, capsys):
         main([f"{option}={value}"])
     assert exit_info.value.code == 2
     assert f"'{value}': give a number of at least 1" in capsys.readouterr().err
+
+
+def test_mistakes_are_one_line(tmp_path, capsys):
+    with pytest.raises(SystemExit):
+        main(["--protocol", "steps"])
+    assert "unknown protocol 'steps'; allowed are all, flat" in capsys.readouterr().err
+    with pytest.raises(SystemExit):
+        main(["--levels", "4,11"])
+    assert "'4,11': give levels from 0 to 10" in capsys.readouterr().err
+    assert main(["--protocol", "sampling", "--out", str(tmp_path)]) == 2
+    assert "lies in no run folder" in capsys.readouterr().err
+    assert main([str(tmp_path)]) == 2
+    assert "error: " in capsys.readouterr().err
+    assert main(["--device", "gpu", "--protocol", "flat", *FEW]) == 2
+    assert "device=gpu: allowed are auto, cpu, cuda" in capsys.readouterr().err

@@ -1,0 +1,166 @@
+"""The paper's heat map: cosine (C), steps (S) and discrete footholds (D) of each skill."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+
+from kiras_rl.envs.quadruped import QuadrupedEnv
+from kiras_rl.tools.protocols import imitation
+from kiras_rl.tools.protocols.crossing import Obstacle, cross, percent, pooled, share
+from kiras_rl.tools.protocols.pooling import pool
+from kiras_rl.tools.protocols.rows import panels
+from kiras_rl.tools.protocols.subject import Subject
+from kiras_rl.tools.protocols.terrain import LEVELS, terrain_env
+from kiras_rl.tools.report.content import Column, Figure, Section, Table
+
+TITLE = "Heat map: steps and discrete footholds"
+TEXT = (
+    "As the protocol terrain, on steps (S) and discrete footholds (D), with many trials, and the "
+    "cosine to the keyframe on flat ground (C) beside them. Headline: steps of 6 cm, gaps of 8 cm "
+    "(times the scale of the robot's terrain)."
+)
+
+HEADLINE = {"S": Obstacle("stairs", 4), "D": Obstacle("footholds", 5)}
+OTHERS = (
+    *(Obstacle("stairs", level) for level in (2, 6, 8)),
+    *(Obstacle("footholds", level) for level in (2, 7, 10)),
+)
+HEADLINE_TRIALS, OTHER_TRIALS = 1000, 200  # of each skill [paper: 1,000]
+CHUNK = 200  # trials of a skill at a time: an interruption loses no more
+
+
+def measure(subject: Subject) -> dict:
+    """Return the counts of each obstacle and skill, and the cosines."""
+
+    @cache
+    def build(trials: int) -> QuadrupedEnv:
+        return terrain_env(subject, trials)
+
+    def counts(obstacle: Obstacle, trials: int) -> dict:
+        parts = [min(CHUNK, trials - done) for done in range(0, trials, CHUNK)]
+        results = []
+        for index, part in enumerate(parts):
+            key = subject.key(
+                "heat_map", type=obstacle.terrain, level=obstacle.level, part=index, trials=part
+            )
+
+            def run(part: int = part, index: int = index) -> dict:
+                return cross(build(part), subject, [obstacle], part, index)[0]
+
+            results.append(subject.ledger.get(key, run))
+        return pool(results)
+
+    options = subject.options
+    return {
+        "terrain": _lengths(subject),
+        "headline": {
+            name: counts(obstacle, options.trials_or(HEADLINE_TRIALS))
+            for name, obstacle in HEADLINE.items()
+        },
+        "others": [
+            {
+                "type": obstacle.terrain,
+                "level": obstacle.level,
+                "cells": counts(obstacle, options.trials_or(OTHER_TRIALS)),
+            }
+            for obstacle in OTHERS
+        ],
+        "cosine": {
+            name: values["cosine"] for name, values in imitation.measure(subject)["skills"].items()
+        },
+    }
+
+
+def _lengths(subject: Subject) -> dict[str, list[float]]:
+    """Return the lowest and the top height of steps and width of moats, m."""
+    terrain = subject.rough().env.terrain
+    ranges = {
+        "stairs": terrain.types["stairs"]["riser"],
+        "footholds": terrain.types["footholds"]["gap"],
+    }
+    return {name: [terrain.scale * x for x in ends] for name, ends in ranges.items()}
+
+
+def section(results: dict[str, dict]) -> Section:
+    """Return the heat maps, the shares with their intervals, and the other levels."""
+    tables = [_headline(name, results) for name in HEADLINE]
+    tables += [_others(label, values) for label, values in results.items()]
+    figures = [_figure(kind, results) for kind in ("success", "strict")]
+    return Section("heat_map", TITLE, TEXT, tables, figures)
+
+
+def _size(values: dict, terrain: str, level: int) -> str:
+    low, high = values["terrain"][terrain]
+    word = {"stairs": "steps", "footholds": "gaps"}[terrain]
+    return f"{word} of {100 * (low + (high - low) * level / (LEVELS - 1)):.1f} cm"
+
+
+def _headline(name: str, results: dict[str, dict]) -> Table:
+    obstacle, first = HEADLINE[name], next(iter(results.values()))
+    rows = [
+        (
+            skill,
+            label,
+            percent(counts, "success"),
+            percent(counts, "strict"),
+            100 * share(counts, "fell"),
+            counts["trials"],
+        )
+        for label, values in results.items()
+        for skill, counts in _with_all(values["headline"][name]).items()
+    ]
+    columns = (
+        Column("skill"),
+        Column("policy"),
+        Column("success", "%"),
+        Column("strict", "%"),
+        Column("falls", "%", "{:.0f}"),
+        Column("trials", form="{}"),
+    )
+    title = f"{name}: {_size(first, obstacle.terrain, obstacle.level)}"
+    return Table(title, columns, rows, "In brackets Wilson's 95 % intervals.")
+
+
+def _with_all(cells: dict[str, dict]) -> dict[str, dict]:
+    return cells | {"all": pooled(cells)}
+
+
+def _others(label: str, values: dict) -> Table:
+    rows, skills = [], list(values["headline"]["S"])
+    for cell in values["others"]:
+        shares = [
+            f"{100 * share(c, 'success'):.0f} ({100 * share(c, 'strict'):.0f})"
+            for c in _with_all(cell["cells"]).values()
+        ]
+        rows.append((_size(values, cell["type"], cell["level"]), *shares))
+    columns = (Column("obstacle"), *map(Column, skills), Column("all"))
+    return Table(f"Other sizes: {label}", columns, rows, "Success in %, in brackets strict.")
+
+
+def _figure(kind: str, results: dict[str, dict]) -> Figure:
+    drawing, axes = panels(3, width=1.2 + 0.9 * len(results), height=3.0)
+    skills = list(next(iter(results.values()))["cosine"])
+    for axis, name in zip(axes, ("C", "S", "D"), strict=True):
+        cells = np.array(
+            [
+                [
+                    values["cosine"][skill]
+                    if name == "C"
+                    else share(values["headline"][name][skill], kind)
+                    for values in results.values()
+                ]
+                for skill in skills
+            ],
+            dtype=float,
+        )
+        axis.imshow(cells, vmin=0.0, vmax=1.0, cmap="Blues", aspect="auto")
+        axis.grid(False)
+        for (row, column), value in np.ndenumerate(cells):
+            ink = "white" if value > 0.6 else "black"
+            axis.text(column, row, f"{value:.2f}", ha="center", va="center", color=ink, fontsize=8)
+        axis.set_title(name)
+        axis.set_yticks(range(len(skills)), skills)
+        axis.set_xticks(range(len(results)), list(results), rotation=30, ha="right", fontsize=7)
+    return Figure(f"Heat map: {kind}", drawing, "C: cosine; S: steps; D: discrete footholds.")

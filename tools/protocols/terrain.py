@@ -1,0 +1,124 @@
+"""Every skill on every rough terrain type at several levels of difficulty."""
+
+from __future__ import annotations
+
+from functools import cache
+
+from kiras_rl.envs.quadruped import QuadrupedEnv
+from kiras_rl.evaluation.terrain import TIME_LIMIT, TerrainResult
+from kiras_rl.tools.evaluator import make_evaluation_env
+from kiras_rl.tools.protocols.crossing import Obstacle, cross, pooled, share
+from kiras_rl.tools.protocols.rows import colours, panels
+from kiras_rl.tools.protocols.subject import Subject
+from kiras_rl.tools.report.content import Column, Figure, Section, Table
+
+TITLE = "Terrain"
+TEXT = (
+    "Every skill crosses every rough terrain type at several levels of difficulty, 0 the lowest "
+    "and 10 the top, with the noise of the training: from the middle of a tile, with any heading, "
+    "which is held, at 0.2 to 0.6 m/s, 3 m far within twice the time of the way and 20 s, without "
+    "a fall; strictly, if thighs and shanks touch the ground in at most 5 % of the steps."
+)
+
+TRIALS = 50  # of a cell
+LEVELS = 11
+"""Whatever the training had: steps of a tenth from lowest to top."""
+
+
+def measure(subject: Subject) -> dict:
+    """Return the counts of each level, type and skill."""
+    options, names = subject.options, rough_names(subject)
+    trials = options.trials_or(TRIALS)
+
+    @cache
+    def build() -> QuadrupedEnv:
+        return terrain_env(subject, trials * len(names))
+
+    def level(number: int) -> dict:
+        obstacles = [Obstacle(name, number) for name in names]
+        return dict(zip(names, cross(build(), subject, obstacles, trials), strict=True))
+
+    def key(number: int) -> str:
+        return subject.key("terrain", level=number, trials=trials)
+
+    return {
+        "levels": {
+            str(number): subject.ledger.get(key(number), lambda number=number: level(number))
+            for number in options.levels
+        }
+    }
+
+
+def terrain_env(subject: Subject, trials: int) -> QuadrupedEnv:
+    """Build the terrain of a policy with LEVELS levels, for `trials` of each skill."""
+    config = subject.rough()
+    config.env.terrain.levels = LEVELS
+    worlds = trials * len(subject.skills)
+    return make_evaluation_env(config, worlds, TIME_LIMIT, subject.options.device)
+
+
+def rough_names(subject: Subject) -> list[str]:
+    """Return the terrain types of a policy that are not flat."""
+    types = subject.rough().env.terrain.types
+    return [name for name, values in types.items() if values is not None and name != "flat"]
+
+
+def section(results: dict[str, dict]) -> Section:
+    """Return a table a level and the shares over the levels."""
+    levels = sorted({int(level) for v in results.values() for level in v["levels"]})
+    tables = [_table(level, results) for level in levels]
+    figures = [_figure(kind, levels, results) for kind in ("success", "strict")]
+    return Section("terrain", TITLE, TEXT, tables, figures)
+
+
+def _table(level: int, results: dict[str, dict]) -> Table:
+    rows, skills = [], []
+    for label, values in results.items():
+        for terrain, cells in values["levels"].get(str(level), {}).items():
+            skills = skills or list(cells)
+            texts = (f"{_percent(c, 'success')} ({_percent(c, 'strict')})" for c in cells.values())
+            rows.append((terrain, label, *texts, 100 * share(pooled(cells), "strict")))
+    columns = (
+        Column("terrain"),
+        Column("policy"),
+        *map(Column, skills),
+        Column("strict, all skills", "%", "{:.0f}"),
+    )
+    note = "Success in %, in brackets strict success."
+    return Table(f"Level {level}", columns, rows, note)
+
+
+def result_table(result: TerrainResult) -> Table:
+    """Return the table of an evaluation beside a training."""
+    rows = [
+        (name, *(f"{100 * a:.0f} ({100 * b:.0f})" for a, b in zip(success, strict, strict=True)))
+        for name, success, strict in zip(
+            result.terrains, result.success.tolist(), result.strict.tolist(), strict=True
+        )
+    ]
+    columns = (Column("terrain"), *map(Column, result.skills))
+    title = f"Terrain, level {result.level}"
+    return Table(title, columns, rows, "Success in %, in brackets strict success.")
+
+
+def _percent(counts: dict, kind: str) -> str:
+    return f"{100 * share(counts, kind):.0f}"
+
+
+def _figure(kind: str, levels: list[int], results: dict[str, dict]) -> Figure:
+    types = list(next(iter(next(iter(results.values()))["levels"].values())))
+    drawing, axes = panels(len(types))
+    for axis, terrain in zip(axes, types, strict=True):
+        for (label, values), colour in zip(results.items(), colours(), strict=False):
+            cells = [values["levels"].get(str(level), {}).get(terrain) for level in levels]
+            known = [
+                (level, 100 * share(pooled(cell), kind))
+                for level, cell in zip(levels, cells, strict=True)
+                if cell
+            ]
+            axis.plot(*zip(*known, strict=True), "o-", color=colour, label=label, markersize=3)
+        axis.set(title=terrain, xlabel="level", ylim=(-3, 103))
+    axes[0].set_ylabel(f"{kind} [%]")
+    axes[0].legend(fontsize=7)
+    title = {"success": "Success over the levels", "strict": "Strict success over the levels"}[kind]
+    return Figure(title, drawing, "Mean over all skills.")

@@ -1,0 +1,1 @@
+"""Results as tables and figures, and the files and pages made of them."""
