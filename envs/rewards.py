@@ -88,6 +88,16 @@ def foot_slip(step: Step) -> torch.Tensor:
     return (speed * step.robot.foot_contact).sum(-1)
 
 
+def foot_clearance(step: Step, height: float) -> torch.Tensor:
+    """Return the sum over feet of horizontal speed times what is missing to `height`, m^2/s.
+
+    A foot that moves ahead should do so high: one that stands costs nothing.
+    """
+    missing = (height - step.robot.foot_height).clamp(min=0.0)
+    speed = torch.linalg.vector_norm(step.robot.foot_vel_w[..., :2], dim=-1)
+    return (missing * speed).sum(-1)
+
+
 def feet_drag(step: Step) -> torch.Tensor:
     """Return minus the summed |v_x| + |v_y| of the standing feet, m/s (weight +0.5 [paper])."""
     speed = step.robot.foot_vel_w[..., :2].abs().sum(-1)

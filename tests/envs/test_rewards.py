@@ -42,6 +42,7 @@ def crafted(command=(0.5, 0.0, 0.2), fresh=False, fallen=False):
     robot.foot_contact = torch.tensor([[True, False]])
     robot.foot_vel_w = torch.tensor([[[0.3, -0.4, 9.0], [5.0, 5.0, 5.0]]])
     robot.foot_force = row(60.0, 12.0)
+    robot._foot_height = row(0.01, 0.08)
     robot.limb_force = row(0.05, 3.0)
     return Step(
         robot=robot,
@@ -78,6 +79,7 @@ EXPECTED = {
     "lin_vel_y_abs": ({}, 0.1),
     "foot_slip": ({}, 0.09 + 0.16),  # the second foot is in the air
     "feet_drag": ({}, -(0.3 + 0.4)),
+    "foot_clearance": ({"height": 0.05}, 0.04 * 0.5),  # the other foot is high enough
     "feet_contact_forces": ({"threshold": 10.0, "largest": 20.0}, 20.0 + 2.0),
     "collision": ({"threshold": 0.1}, 1.0),
     "stand_still": ({}, 0.0),
