@@ -351,10 +351,15 @@ def test_options_that_cannot_be_are_refused(option, tmp_path, capsys):
 
 def test_an_interrupt_leaves_nothing(tmp_path, capsys):
     """The shipped policy stands for hours, unless somebody presses Ctrl-C."""
+    # Python leaves SIGINT ignored where it began so, as in the background of a shell.
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
     timer = threading.Timer(1.0, os.kill, (os.getpid(), signal.SIGINT))
     line = ["--skills=walk", "--episodes=1", "--duration=36000", "--nominal", "--command=0"]
     timer.start()
-    assert main([*line, "--out", str(tmp_path / "out")]) == 130
-    timer.join()
+    try:
+        assert main([*line, "--out", str(tmp_path / "out")]) == 130
+    finally:
+        timer.join()
+        signal.signal(signal.SIGINT, before)
     assert capsys.readouterr().err == "interrupted: nothing was written\n"
     assert list(tmp_path.iterdir()) == []
