@@ -92,7 +92,8 @@ class CountingEnv(SkillEnv):
     def unused(self, *args):
         raise NotImplementedError
 
-    seed = reset = place = set_task = measure = describe = state_dict = load_state_dict = unused
+    seed = reset = place = set_task = measure = foot_height_b = unused
+    describe = state_dict = load_state_dict = unused
 
 
 @pytest.fixture

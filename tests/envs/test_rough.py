@@ -175,7 +175,7 @@ def test_who_gets_far_enough_in_time_succeeds(build, monkeypatch):
     monkeypatch.setattr("kiras_rl.evaluation.terrain.TIME_LIMIT", 2.5)
     env = build("env.terminations.episode_length=21")
     terrain = torch.full((8,), env.terrains.index("flat"))
-    speed = torch.tensor([1.5, 1.5, 3.0, 3.0, 1.0, 1.0, 1.5, 1.5])
+    speed = torch.tensor([2.0, 2.0, 3.0, 3.0, 1.0, 1.0, 2.0, 2.0])
     trials = Trials(terrain, torch.zeros_like(terrain), torch.zeros_like(terrain), speed)
     slow = torch.arange(8) >= 6
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from kiras_rl import evaluation
 from kiras_rl.deploy.policy import OnboardPolicy
+from kiras_rl.evaluation import flat
 from kiras_rl.tools.driver import Driver
 from kiras_rl.tools.script import Segment, record
 from kiras_rl.tools.summary import (
@@ -37,11 +37,12 @@ def test_quantities_are_those_of_the_evaluation_in_training():
     random = np.random.default_rng(0)
     signal, contact = random.normal(size=200), random.random((200, 4)) < 0.5
     torch_signal, torch_contact = torch.tensor(signal)[:, None], torch.tensor(contact)[:, None]
-    averaged = evaluation.moving_average(torch_signal, 0.02)[:, 0]
-    lifts = evaluation.lifts_per_second(torch_contact, 0.02)
+    averaged = flat.moving_average(torch_signal, 0.02)[:, 0]
+    always = torch.ones(200, 1, dtype=torch.bool)
+    lifts = flat.lifts_per_second(torch_contact, always, 0.02).amin(dim=-1)
     np.testing.assert_allclose(moving_average(signal, 50), averaged)
     assert lifts_per_second(contact, np.ones(200, bool), 50).min() == pytest.approx(lifts.item())
-    assert (SETTLE, AVERAGE) == (evaluation.SETTLE, evaluation.AVERAGE)
+    assert (SETTLE, AVERAGE) == (flat.SETTLE, flat.AVERAGE)
 
 
 @pytest.fixture(scope="module")
