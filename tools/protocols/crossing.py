@@ -13,7 +13,7 @@ from kiras_rl.evaluation.terrain import Trials, run_trials
 from kiras_rl.tools.protocols.subject import Subject
 
 SPEEDS = (0.2, 0.6)
-"""Commanded v_x, m/s: drawn anew for each trial."""
+"""Commanded v_x, m/s: spread evenly over the trials of a skill."""
 
 Z = 1.959963984540054
 """Standard normal quantile of a two-sided 95 % interval."""
