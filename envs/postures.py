@@ -74,13 +74,20 @@ class Postures:
         qvel[:, :2] = scale_to(random["velocity"], -speed, speed)
         return qpos, qvel
 
-    def at_rest(self, skill: torch.Tensor, command: torch.Tensor) -> View:
-        """Return what robots at rest in the keyframes `skill`, (K,), would observe.
+    def at_rest(self, speeds: list[float]) -> View:
+        """Return what robots at rest would observe: each keyframe with each command.
 
         Args:
-            skill: Indices of skills.
-            command: Velocity commands, (K, 3).
+            speeds: G commands v_x, m/s.
+
+        Returns:
+            S * G robots, the commands of the first skill first.
         """
+        device = self._keyframes.height.device
+        count = len(self._keyframes.height)
+        skill = torch.arange(count, device=device).repeat_interleave(len(speeds))
+        command = torch.zeros(len(skill), 3, device=device)
+        command[:, 0] = torch.tensor(speeds, device=device).repeat(count)
         robot = RobotState.at_rest(self._keyframes, skill, self._num_feet)
         task = Task.of(command, skill, skill)
         action = self.holding(robot.joint_pos)

@@ -98,10 +98,9 @@ class QuadrupedEnv(SkillEnv):
     def _build_terms(self, seed: int) -> None:
         cfg = self.cfg
         self._observer = Observer(cfg.observations, self._view())
-        skills = torch.arange(len(self.skills), device=self.device)
-        at_rest = self._postures.at_rest(skills, torch.zeros(len(skills), 3, device=self.device))
         phi = self._observer.imitation
-        self.keyframe_features, self.feature_noise = phi(at_rest), phi.noise
+        self.keyframe_features = phi(self._postures.at_rest([0.0]))
+        self.feature_noise = phi.noise
         self.imitation_terms = tuple(zip(phi.names, phi.sizes, phi.scales, strict=True))
         self._rewards = RewardSum(cfg.rewards, self.step_dt, self.device)
         generator = torch.Generator(device=self.device)
@@ -356,13 +355,9 @@ class QuadrupedEnv(SkillEnv):
 
     def keyframe_observations(self) -> torch.Tensor:
         """Return critic observations at rest in each keyframe for G commands, (S, G, C)."""
-        count, grid = len(self.skills), len(KEYFRAME_COMMANDS)
-        skills = torch.arange(count, device=self.device).repeat_interleave(grid)
-        command = torch.zeros(count * grid, 3, device=self.device)
         largest = self.cfg.commands.lin_vel_x[1]
-        command[:, 0] = largest * torch.tensor(KEYFRAME_COMMANDS, device=self.device).repeat(count)
-        view = self._postures.at_rest(skills, command)
-        return self._observer.privileged(view).unflatten(0, (count, grid))
+        view = self._postures.at_rest([largest * share for share in KEYFRAME_COMMANDS])
+        return self._observer.privileged(view).unflatten(0, (len(self.skills), -1))
 
     def describe(self) -> dict:
         """Return the deployment contract of a policy trained here."""
