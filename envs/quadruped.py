@@ -160,7 +160,9 @@ class QuadrupedEnv(SkillEnv):
         self._random.refill()
 
         invalid = self.sim.diverged | self.sim.overflowed
-        fallen = self._fallen() | invalid
+        fallen = invalid | terminations.fallen(
+            self.robot, self.task, self.keyframes, self.cfg.terminations
+        )
         crossed = self._crossed()
         time_outs = ((self._length >= self.max_episode_length) | crossed) & ~fallen
         terms = self._judge(last_action, fallen, invalid)
@@ -189,13 +191,6 @@ class QuadrupedEnv(SkillEnv):
     def _distance(self) -> torch.Tensor:
         """Return how far bases are from the middle of their tile, max(|x|, |y|), (N,), m."""
         return self.robot.base_pos_w[:, :2].abs().amax(dim=1)
-
-    def _fallen(self) -> torch.Tensor:
-        limits = self.cfg.terminations
-        cos_limit = math.cos(math.radians(limits.max_tilt))
-        return terminations.base_contact(
-            self.robot, limits.base_contact_force
-        ) | terminations.tilted(self.robot, self.task, self.keyframes, cos_limit)
 
     def _judge(
         self, last_action: torch.Tensor, fallen: torch.Tensor, invalid: torch.Tensor
@@ -393,12 +388,7 @@ class QuadrupedEnv(SkillEnv):
         self.robot.read_kinematics()
 
 
-_BUFFERS = (
-    "_length",
-    "_action",
-    "_last_joint_vel",
-    "_last_joint_torque",
-)
+_BUFFERS = ("_length", "_action", "_last_joint_vel", "_last_joint_torque")
 
 
 def _unless(mask: torch.Tensor, new: torch.Tensor, old: torch.Tensor) -> torch.Tensor:

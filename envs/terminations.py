@@ -2,9 +2,21 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 
 from kiras_rl.envs.state import Keyframes, RobotState, Task
+from kiras_rl.schema import TerminationConfig
+
+
+def fallen(
+    robot: RobotState, task: Task, keyframes: Keyframes, limits: TerminationConfig
+) -> torch.Tensor:
+    """Return the worlds that fail by any of the reasons below."""
+    cos_limit = math.cos(math.radians(limits.max_tilt))
+    pressed = base_contact(robot, limits.base_contact_force)
+    return pressed | tilted(robot, task, keyframes, cos_limit)
 
 
 def base_contact(robot: RobotState, force: float) -> torch.Tensor:
