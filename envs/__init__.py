@@ -12,12 +12,16 @@ if TYPE_CHECKING:
     import torch
 
     from kiras_rl.envs.quadruped import QuadrupedEnv
+    from kiras_rl.robots.robot import Robot
 
 BACKENDS = ("auto", "native", "warp")
 
 
 def make_env(
-    config: Config, device: torch.device | str = "cpu", num_envs: int | None = None
+    config: Config,
+    device: torch.device | str = "cpu",
+    num_envs: int | None = None,
+    robot: Robot | None = None,
 ) -> QuadrupedEnv:
     """Build the environment of a configuration.
 
@@ -25,6 +29,7 @@ def make_env(
         config: The run.
         device: Where the tensors live; `auto` takes the native backend on a CPU, else warp.
         num_envs: Worlds, if not the configuration's.
+        robot: The robot, if not the configuration's: one with other keyframes, say.
 
     Raises:
         ConfigError: Unknown backend, or the native backend on a GPU.
@@ -39,7 +44,7 @@ def make_env(
     return QuadrupedEnv(
         config.env,
         config.sim,
-        load_robot(config.robot),
+        robot or load_robot(config.robot),
         num_envs or config.num_envs,
         resolve_backend(config.sim.backend, device),
         device,

@@ -1,4 +1,4 @@
-"""kiras-bench: measure what the environment and the learner cost, as ratios within one run."""
+"""kiras-bench: how fast everything is on this machine, as ratios within one run."""
 
 from __future__ import annotations
 
@@ -6,12 +6,12 @@ import argparse
 import json
 import os
 import sys
-from collections.abc import Callable
-from dataclasses import asdict, replace
+from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
-from statistics import median
+from types import ModuleType
+from typing import TextIO
 
-import numpy as np
 import torch
 from rich.console import Console
 from rich.table import Table
@@ -21,10 +21,17 @@ from kiras_rl.config import ConfigError, load_config
 from kiras_rl.deploy.policy import PolicyError
 from kiras_rl.robots.robot import RobotError
 from kiras_rl.schema import Config
-from kiras_rl.tools import bench_environment as environment
-from kiras_rl.tools import bench_learning as learning
-from kiras_rl.tools.bench_inference import measure_inference
-from kiras_rl.tools.timing import Times, ratios, summarise
+from kiras_rl.tools.benchmarks import (
+    bound,
+    inference,
+    iteration,
+    learning,
+    peer,
+    physics,
+    scale,
+    terrain,
+)
+from kiras_rl.tools.benchmarks.request import Figures, Request
 from kiras_rl.tools.training import resolve_device
 
 DESCRIPTION = """\
@@ -42,27 +49,47 @@ learning   seconds of an iteration of KiRAS, against stock rsl-rl PPO with the s
            twice, the second time with the rollout on one thread, as KiRAS has it; the faster one
            counts. Then the price of each part of KiRAS, from leaving it out. AdaBoot withholds no
            update of the estimator meanwhile: the price is that of a full iteration.
+iteration  where the time of an iteration goes, in both phases
+bound      seconds of an iteration against what it cannot do without: mujoco.batch over the same
+           steps, and the matrix products of the update at the rate of this machine; target: 85 %.
+           Always the native backend on the CPU.
 inference  control steps of the exported policy on one thread
 
-With 1024 worlds and 5 rounds this takes about four minutes on two quiet cores.
+Only when they are named with --parts, because they take long:
+
+scale      speed and memory of the environment from 256 worlds upwards, doubled until memory is
+           short; then of one size on terrain, without height_scan, and with 1, 5 and 10 skills
+peer       the Go1 of this project beside mjlab's; needs --peer, which also adds this part
 """
 
 EXAMPLES = """\
 examples:
-  kiras-bench                                     everything, Solo-8, 1024 worlds
+  kiras-bench --out figures                       the first six parts, Solo-8, 1024 worlds
   kiras-bench --parts physics --worlds 4096       the environment alone
-  kiras-bench --parts learning --json out.json    all rounds' figures in a file, too
+  kiras-bench --parts scale --plot --out figures  pictures, too
+  kiras-bench --parts scale --worlds 512,2048     these numbers of worlds
+  kiras-bench --parts scale sim.backend=warp      the other backend
+  kiras-bench --parts peer --peer /opt/mjlab/bin/python
   kiras-bench sim.threads=1 sim.substeps=8        any key of the configuration
   taskset -c 0,1 kiras-bench                      on two cores of many
 """
 
-SPEED_TARGET = 0.8  # of bare mujoco.batch
-TERRAIN_SPEED_TARGET = 0.75  # of bare mujoco.batch on the same terrain
-TERRAIN_COST_TARGET = 2.5  # times a step on flat ground
-PRICE_TARGET = 1.3  # iterations of stock rsl-rl PPO
+PARTS: dict[str, ModuleType] = {
+    "physics": physics,
+    "terrain": terrain,
+    "learning": learning,
+    "iteration": iteration,
+    "bound": bound,
+    "inference": inference,
+    "scale": scale,
+    "peer": peer,
+}
+USUAL = ("physics", "terrain", "learning", "iteration", "bound", "inference")
+WORLDS = 1024
 BUSY = 0.5  # mean number of running programs in the last minute
 
-Figures = dict[str, object]
+FIGURES, TABLES = "figures.json", "tables.txt"
+"""Files in the folder of --out."""
 
 console = Console()
 
@@ -71,9 +98,7 @@ def main(argv: list[str] | None = None) -> int:
     """Run the command; return its exit code."""
     args = _parse(argv)
     try:
-        report = bench(args)
-        if args.json:
-            args.json.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
+        bench(args)
     except (ConfigError, PolicyError, RobotError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
@@ -88,20 +113,43 @@ def _parse(argv: list[str] | None) -> argparse.Namespace:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--cfg", default="solo8", help="configuration (default: solo8)")
-    parser.add_argument("--worlds", type=_count, default=1024, help="(default: 1024)")
+    parser.add_argument(
+        "--worlds",
+        type=_counts,
+        default=(),
+        metavar="N[,N...]",
+        help=f"scale takes all of them, the other parts the first (default: {WORLDS})",
+    )
     parser.add_argument("--rounds", type=_count, default=5, help="that are measured (default: 5)")
     parser.add_argument(
-        "--parts", type=_parts, default=tuple(PARTS), help=f"(default: {','.join(PARTS)})"
+        "--parts", type=_parts, metavar="PART[,PART...]", help=f"(default: {','.join(USUAL)})"
     )
-    parser.add_argument("--json", type=Path, metavar="FILE", help="also write the figures there")
+    parser.add_argument(
+        "--peer", metavar="PYTHON", help="interpreter of the environment that mjlab is installed in"
+    )
+    parser.add_argument(
+        "--out", type=Path, metavar="FOLDER", help=f"write {FIGURES} and {TABLES} there"
+    )
+    parser.add_argument("--plot", action="store_true", help="pictures of iteration and scale, too")
     parser.add_argument("overrides", nargs="*", metavar="key=value", help="keys to set")
-    return parser.parse_intermixed_args(argv)
+    args = parser.parse_intermixed_args(argv)
+    if args.parts is None:
+        args.parts = ("peer",) if args.peer else USUAL
+    if "peer" in args.parts and not args.peer:
+        parser.error("the part peer needs --peer PYTHON: the environment that mjlab is in")
+    if args.plot and not args.out:
+        parser.error("--plot needs --out FOLDER: where pictures are written")
+    return args
 
 
 def _count(text: str) -> int:
     if not text.isdecimal() or int(text) < 1:
         raise argparse.ArgumentTypeError(f"'{text}' is not a number of at least 1")
     return int(text)
+
+
+def _counts(text: str) -> tuple[int, ...]:
+    return tuple(_count(word) for word in text.split(","))
 
 
 def _parts(text: str) -> tuple[str, ...]:
@@ -112,39 +160,47 @@ def _parts(text: str) -> tuple[str, ...]:
     return parts
 
 
-def bench(args: argparse.Namespace) -> dict[str, Figures]:
-    """Measure, print tables and return all figures.
+def bench(args: argparse.Namespace) -> None:
+    """Measure, print tables, and save what `args` ask for after each part.
 
     Raises:
         ConfigError: A configuration that cannot be used.
     """
     config = _config(args)
+    request = Request(
+        config, args.rounds, resolve_device(config.device), sizes=args.worlds, peer=args.peer
+    )
     report: dict[str, Figures] = {"machine": _machine(config), "settings": _settings(args)}
-    console.print(_facts("machine", report["machine"]))
+    tables = [_facts("machine", report["machine"])]
+    console.print(*tables)
     if os.getloadavg()[0] > BUSY:
         console.print("[yellow]other programs are running: the figures will be noisy[/]")
-    for part in args.parts:
-        with console.status(f"measuring {part} ..."):
-            report[part], tables = PARTS[part](config, args.rounds)
-        for table in tables:
-            console.print(table, "")
-    return report
+    for name in args.parts:
+        with console.status(f"measuring {name} ..."):
+            report[name] = PARTS[name].measure(request)
+        shown = PARTS[name].table(report[name])
+        _print(shown, console)
+        tables += shown
+        if args.out:
+            _save(args.out, report, tables)
+        if args.plot and hasattr(PARTS[name], "plot"):
+            PARTS[name].plot(report[name], args.out / f"{name}.png")
 
 
 def _config(args: argparse.Namespace) -> Config:
     if any(item.startswith("num_envs=") for item in args.overrides):
         raise ConfigError("num_envs cannot be set here: use --worlds")
-    if args.json and not args.json.parent.is_dir():
-        raise ConfigError(f"--json {args.json}: there is no folder {args.json.parent}")
+    if args.out:
+        args.out.mkdir(parents=True, exist_ok=True)
     config = load_config(args.cfg, args.overrides)
-    return replace(config, num_envs=args.worlds)
+    return replace(config, num_envs=args.worlds[0] if args.worlds else WORLDS)
 
 
 def _settings(args: argparse.Namespace) -> Figures:
     return {
         "cfg": args.cfg,
         "overrides": args.overrides,
-        "worlds": args.worlds,
+        "worlds": list(args.worlds) or [WORLDS],
         "rounds": args.rounds,
     }
 
@@ -170,142 +226,6 @@ def _cpu_model() -> str:
     return models[0] if models else os.uname().machine
 
 
-# --- parts --------------------------------------------------------------------------------------
-
-
-def _physics(config: Config, rounds: int) -> tuple[Figures, list[Table]]:
-    measured = environment.measure_environment(config, rounds)
-    steps = measured.steps
-    speed = {name: summarise(ratios(steps, environment.BARE, name)) for name in steps}
-    rates = {name: config.num_envs / median(times) for name, times in steps.items()}
-    figures: Figures = {
-        "seconds_per_step": {name: summarise(times) for name, times in steps.items()},
-        "steps_per_second": rates,
-        "share_of_bare_speed": speed,
-        "target": SPEED_TARGET,
-        "share_of_worlds_reset": measured.resets,
-        "parts_seconds": {part: median(times) for part, times in measured.parts.items()},
-        "rounds": asdict(measured),
-    }
-    title = f"control steps of {config.num_envs} worlds"
-    table = _table(title, "ms", "env steps/s", "of bare speed", "range")
-    for name, times in steps.items():
-        ms = f"{1e3 * median(times):.2f}"
-        table.add_row(name, ms, f"{rates[name]:,.0f}", *_with_range(speed[name]))
-    reached = speed[environment.ENVIRONMENT]["median"]
-    table.caption = _verdict(reached >= SPEED_TARGET, f"target: at least {SPEED_TARGET}")
-    return figures, [table, _parts_of_a_step(measured)]
-
-
-def _parts_of_a_step(measured: environment.EnvironmentTimes) -> Table:
-    seconds = {part: median(times) for part, times in measured.parts.items()}
-    whole = sum(seconds.values())
-    title = f"one environment step ({100 * measured.resets:.1f} % of the worlds reset)"
-    table = _table(title, "ms", "%")
-    for part, value in seconds.items():
-        table.add_row(part, f"{1e3 * value:.2f}", f"{100 * value / whole:.1f}")
-    return table
-
-
-def _terrain(config: Config, rounds: int) -> tuple[Figures, list[Table]]:
-    steps = environment.measure_terrain(config, rounds)
-    share = summarise(ratios(steps, environment.BARE_TERRAIN, environment.TERRAIN))
-    cost = summarise(ratios(steps, environment.TERRAIN, environment.ENVIRONMENT))
-    columns = ("ms", "env steps/s", "of bare speed", "times flat ground")
-    table = _table(f"control steps of {config.num_envs} worlds", *columns)
-    for name, times in steps.items():
-        row = [f"{1e3 * median(times):.2f}", f"{config.num_envs / median(times):,.0f}"]
-        if name == environment.TERRAIN:
-            row += ["{} ({})".format(*_with_range(figure)) for figure in (share, cost)]
-        table.add_row(name, *row)
-    fast, cheap = share["median"] >= TERRAIN_SPEED_TARGET, cost["median"] <= TERRAIN_COST_TARGET
-    table.caption = "\n".join(
-        (
-            _verdict(fast, f"target: at least {TERRAIN_SPEED_TARGET} of bare speed"),
-            _verdict(cheap, f"target: at most {TERRAIN_COST_TARGET} times flat ground"),
-        )
-    )
-    figures: Figures = {
-        "seconds_per_step": {name: summarise(times) for name, times in steps.items()},
-        "share_of_bare_speed": share,
-        "times_flat": cost,
-        "targets": [TERRAIN_SPEED_TARGET, TERRAIN_COST_TARGET],
-        "rounds": steps,
-    }
-    return figures, [table]
-
-
-def _learning(config: Config, rounds: int) -> tuple[Figures, list[Table]]:
-    measured = learning.measure_learning(config, rounds, resolve_device(config.device))
-    times, updates = measured.iterations, measured.updates
-    stock = min(learning.STOCK, learning.STOCK_SINGLE, key=lambda name: median(times[name]))
-    against = {name: summarise(ratios(times, name, stock)) for name in times}
-    prices = _prices(times)
-    figures: Figures = {
-        "seconds_per_iteration": {name: summarise(t) for name, t in times.items()},
-        "seconds_per_update": {name: summarise(t) for name, t in updates.items()},
-        "reference": stock,
-        "times_reference": against,
-        "target": PRICE_TARGET,
-        "price_seconds": prices,
-        "rounds": asdict(measured),
-    }
-    title = f"iterations of {config.num_envs} worlds x {config.learner.ppo.num_steps} steps"
-    table = _table(title, "s", "update, s", "ratio", "range")
-    for name, t in times.items():
-        seconds = (f"{median(t):.3f}", f"{median(updates[name]):.3f}")
-        table.add_row(name, *seconds, *_with_range(against[name]))
-    reached = against[learning.KIRAS]["median"]
-    target = f"reference: {stock}; target: at most {PRICE_TARGET}"
-    table.caption = _verdict(reached <= PRICE_TARGET, target)
-    return figures, [table, _price_list(prices, median(times[learning.KIRAS]))]
-
-
-def _prices(times: Times) -> dict[str, float]:
-    """Return how much longer an iteration with a part takes than without, the median, s."""
-    full = times[learning.KIRAS]
-    return {
-        part: median(a - b for a, b in zip(full, times[learning.without(part)], strict=True))
-        for part in learning.REMOVABLE
-        if learning.without(part) in times
-    }
-
-
-def _price_list(prices: dict[str, float], whole: float) -> Table:
-    table = _table("price of a part of KiRAS", "s an iteration", "% of KiRAS")
-    for part, seconds in prices.items():
-        table.add_row(part, f"{seconds:+.3f}", f"{100 * seconds / whole:+.1f}")
-    return table
-
-
-def _inference(config: Config, rounds: int) -> tuple[Figures, list[Table]]:
-    middle, slow = np.quantile(measure_inference(config, rounds), (0.5, 0.99)).tolist()
-    table = _table("exported policy, one thread", "median, ms", "p99, ms")
-    table.add_row("control step", f"{1e3 * middle:.3f}", f"{1e3 * slow:.3f}")
-    return {"median_seconds": middle, "p99_seconds": slow}, [table]
-
-
-Part = Callable[[Config, int], tuple[Figures, list[Table]]]
-
-PARTS: dict[str, Part] = {
-    "physics": _physics,
-    "terrain": _terrain,
-    "learning": _learning,
-    "inference": _inference,
-}
-
-
-# --- tables -------------------------------------------------------------------------------------
-
-
-def _table(title: str, *columns: str) -> Table:
-    table = Table(title=title, title_justify="left", caption_justify="left")
-    table.add_column("", no_wrap=True)
-    for column in columns:
-        table.add_column(column, justify="right")
-    return table
-
-
 def _facts(title: str, facts: Figures) -> Table:
     table = Table(title=title, title_justify="left", show_header=False)
     for name, value in facts.items():
@@ -313,12 +233,20 @@ def _facts(title: str, facts: Figures) -> Table:
     return table
 
 
-def _with_range(summary: dict[str, float]) -> tuple[str, str]:
-    return f"{summary['median']:.2f}", f"{summary['min']:.2f} to {summary['max']:.2f}"
+def _save(folder: Path, report: dict[str, Figures], tables: Iterable[Table]) -> None:
+    """Write all figures and tables until now: a part that fails later loses none of them."""
+    (folder / FIGURES).write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
+    with (folder / TABLES).open("w", encoding="utf-8") as file:
+        _print(tables, _plain(file))
 
 
-def _verdict(is_met: bool, target: str) -> str:
-    return f"[green]{target}: met[/]" if is_met else f"[red]{target}: missed[/]"
+def _plain(file: TextIO) -> Console:
+    return Console(file=file, width=160, color_system=None)
+
+
+def _print(tables: Iterable[Table], to: Console) -> None:
+    for table in tables:
+        to.print(table, "")
 
 
 if __name__ == "__main__":

@@ -3,15 +3,22 @@
 from __future__ import annotations
 
 import json
+import sys
 import time
+from itertools import pairwise
 
 import pytest
 import torch
 
+from kiras_rl.robots.robot import load_robot
 from kiras_rl.tools import timing
 from kiras_rl.tools.bench import main
+from kiras_rl.tools.benchmarks import scale
 
-SMALL = ("--worlds=16", "--rounds=1", "learner.ppo.num_steps=4", "learner.ppo.num_mini_batches=2")
+SMALL = (
+    *("--worlds=16", "--rounds=1", "learner.ppo.num_steps=4", "learner.ppo.num_mini_batches=2"),
+    *("learner.imitation.discriminator.batch_size=32", "finetuning.env.terrain.levels=2"),
+)
 
 
 @pytest.fixture(autouse=True)
@@ -28,9 +35,8 @@ def bench(tmp_path, capsys):
     """Run the command on a small scale; return its figures and what it printed."""
 
     def run(*arguments):
-        path = tmp_path / "out.json"
-        assert main([*SMALL, f"--json={path}", *arguments]) == 0
-        return json.loads(path.read_text()), capsys.readouterr().out
+        assert main([*SMALL, f"--out={tmp_path}", *arguments]) == 0
+        return json.loads((tmp_path / "figures.json").read_text()), capsys.readouterr().out
 
     return run
 
@@ -57,7 +63,7 @@ def test_the_parts_of_an_environment_step_are_named_and_timed(bench):
 
 
 def test_terrain_is_measured_against_the_batch_on_it_and_against_flat_ground(bench):
-    report, out = bench("--parts=terrain", "finetuning.env.terrain.levels=2")
+    report, out = bench("--parts=terrain")
     seconds = report["terrain"]["seconds_per_step"]
     flat, bare, rough = (
         seconds[name]["median"]
@@ -86,8 +92,8 @@ def test_every_part_of_the_learner_has_a_price(bench):
 
 
 def test_a_part_that_the_configuration_lacks_has_no_price(bench):
-    report, _ = bench("--parts=learning", "learner.imitation=null", "learner.estimator=null")
-    assert list(report["learning"]["price_seconds"]) == ["multi_critic", "skill_init"]
+    report, _ = bench("--parts=learning", "learner.estimator=null", "learner.skill_init=null")
+    assert list(report["learning"]["price_seconds"]) == ["imitation", "multi_critic"]
 
 
 def test_the_exported_policy_is_fast_enough_for_50_hz(bench):
@@ -96,11 +102,132 @@ def test_the_exported_policy_is_fast_enough_for_50_hz(bench):
     assert inference["median_seconds"] <= inference["p99_seconds"]
 
 
+def test_the_parts_of_an_iteration_make_the_whole_in_both_phases(bench, tmp_path):
+    iteration = bench("--parts=iteration", "--plot")[0]["iteration"]
+    learning, finetuning = iteration["seconds"].values()
+    for part in ("physics", "act", "record", "returns", "policy update", "estimator", "rest"):
+        assert learning[part] > 0.0
+        assert finetuning[part] > 0.0
+    assert set(learning) - set(finetuning) == {
+        *("imitation scoring", "premium windows", "discriminator")
+    }
+    assert set(finetuning) - set(learning) == {"residual reward"}
+    assert (tmp_path / "iteration.png").read_bytes().startswith(b"\x89PNG")
+
+
+def layers(*widths):
+    """Multiplications of a forward pass on one row, of all layers and of the first."""
+    products = [a * b for a, b in pairwise(widths)]
+    return sum(products), products[0]
+
+
+def test_the_bound_is_physics_and_the_arithmetic_of_the_update(bench):
+    report, out = bench("--parts=bound")
+    bound = report["bound"]
+    # A step on B rows: outputs and gradients of weights on all layers, gradients of inputs on all
+    # but the first; an addition for each multiplication. 8 steps: 4 epochs of 2 mini-batches.
+    rows = 16 * 4 // 2
+    actor, actor_first = layers(45, 128, 128, 128, 8)
+    critic, critic_first = layers(107, 128, 128, 128, 1)
+    step = 2 * rows * (3 * (actor + 2 * critic) - actor_first - 2 * critic_first)
+    assert bound["operations"]["policy"] == 8 * step
+    assert bound["shapes"] == {
+        "policy": "32 x 128 x 128",
+        "estimator": "32 x 128 x 128",
+        "discriminator": "64 x 512 x 256",
+    }
+    seconds = bound["seconds"]
+    for network, count in bound["operations"].items():
+        rate = bound["operations_per_second"][bound["shapes"][network]]
+        assert seconds[network] == pytest.approx(count / rate)
+    parts = sum(seconds[name] for name in ("bare physics", *bound["operations"]))
+    assert seconds["bound"] == pytest.approx(parts)
+    assert bound["share_of_bound"]["median"] == pytest.approx(
+        seconds["bound"] / seconds["iteration"]
+    )
+    assert "target: at least 0.85" in out
+
+
+@pytest.mark.slow
+def test_worlds_are_added_until_memory_is_short(bench, tmp_path):
+    sizes = "--worlds=4,8,1000000000"
+    report, out = bench("--parts=scale", sizes, "finetuning=null", "--plot")
+    measured = report["scale"]
+    assert [size["worlds"] for size in measured["sizes"]] == [4, 8]
+    assert measured["stopped"].startswith("1000000000 worlds would take ")
+    assert measured["stopped"] in " ".join(out.split())
+    for size in measured["sizes"]:
+        assert size["steps_per_second"] == pytest.approx(size["worlds"] / size["seconds_per_step"])
+        assert size["memory_bytes"] > 0
+    skills = {name: variant["skills"] for name, variant in measured["variants"].items()}
+    assert skills == {
+        "flat ground": 5,
+        "flat ground, without height_scan": 5,
+        "flat ground, 1 skill": 1,
+        "flat ground, 5 skills": 5,
+        "flat ground, 10 skills": 10,
+    }
+    assert (tmp_path / "scale.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_more_skills_than_a_robot_has_are_its_own_again():
+    robot = load_robot("solo8")
+    more = scale.with_skills(robot, 7)
+    assert len(set(more.skills)) == 7
+    assert more.keyframes[6].base_height == robot.keyframes[1].base_height
+
+
+@pytest.fixture
+def stand_in(tmp_path):
+    """An interpreter that answers as mjlab's script does: 5 s for the steps of every round."""
+    path = tmp_path / "python"
+    path.write_text(
+        f"#!{sys.executable}\n"
+        "import json, sys\n"
+        "about = {'task': 'none', 'versions': {'arguments': ' '.join(sys.argv[2:])}}\n"
+        "print(json.dumps(about), flush=True)\n"
+        "for _ in sys.stdin:\n"
+        "    print(5.0, flush=True)\n"
+    )
+    path.chmod(0o755)
+    return path
+
+
+def test_a_peer_takes_turns_with_us(bench, stand_in):
+    report, out = bench(f"--peer={stand_in}", "device=cpu")
+    peer = report["peer"]
+    assert peer["versions"]["mjlab"] == {"arguments": "cpu 16 50"}
+    assert peer["seconds_per_step"]["mjlab"]["median"] == 0.1  # 5 s, 50 steps
+    assert peer["steps_per_second"]["mjlab"] == 160.0
+    ours = peer["seconds_per_step"]["KiRAS-RL"]["median"]
+    assert peer["times_as_fast"]["KiRAS-RL"]["median"] == pytest.approx(0.1 / ours)
+    assert "KiRAS-RL" in out
+
+
+@pytest.mark.parametrize(
+    ("python", "message"),
+    [(sys.executable, "No module named 'mjlab'"), ("/no/python", "No such file or directory")],
+)
+def test_a_peer_that_does_not_run_is_explained(python, message, capsys):
+    assert main([*SMALL, f"--peer={python}", "device=cpu"]) == 2
+    err = capsys.readouterr().err
+    assert err.startswith(f"error: --peer {python}: ")
+    assert err.count("\n") == 1
+    assert message in err
+
+
+def test_tables_are_saved_as_they_are_printed(bench, tmp_path):
+    bench("--parts=inference")
+    tables = (tmp_path / "tables.txt").read_text()
+    assert "exported policy, one thread" in tables
+    assert "mujoco-warp" in tables
+
+
 def test_the_report_says_where_and_with_what_it_was_measured(bench):
     report, out = bench("--parts=inference", "seed=3")
     assert report["machine"]["cores"] >= 1
     assert report["machine"]["mujoco"].startswith("4.")
-    assert report["settings"]["worlds"] == 16
+    assert report["settings"]["worlds"] == [16]
     assert "seed=3" in report["settings"]["overrides"]
     assert report["machine"]["CPU"] in out
 
@@ -108,7 +235,10 @@ def test_the_report_says_where_and_with_what_it_was_measured(bench):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("--parts=speed",), "no part 'speed'; there are physics, terrain, learning, inference"),
+        (("--parts=speed",), "no part 'speed'; there are physics, terrain, learning, iteration"),
+        (("--worlds=8,x",), "'x' is not a number of at least 1"),
+        (("--parts=peer",), "the part peer needs --peer PYTHON"),
+        (("--plot",), "--plot needs --out FOLDER"),
         (("--worlds=0",), "'0' is not a number of at least 1"),
         (("--rounds=many",), "'many' is not a number of at least 1"),
     ],
@@ -126,7 +256,7 @@ def test_a_wrong_argument_is_explained(arguments, message, capsys):
         (("--cfg=solo9",), "no configuration 'solo9'"),
         (("num_envs=8",), "use --worlds"),
         (("robot=cat", "--parts=physics"), "cat"),
-        (("--json=nowhere/out.json",), "nowhere"),
+        (("--parts=terrain", "finetuning=null"), "no terrain to measure"),
     ],
 )
 def test_a_mistake_is_one_line(arguments, message, capsys):

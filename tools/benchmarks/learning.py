@@ -7,9 +7,11 @@ import copy
 import io
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from statistics import median
 
 import torch
+from rich.table import Table
 from rsl_rl.env import VecEnv
 from rsl_rl.runners import OnPolicyRunner
 from tensordict import TensorDict
@@ -21,23 +23,17 @@ from kiras_rl.envs.quadruped import QuadrupedEnv
 from kiras_rl.process import single_threaded
 from kiras_rl.runner import KirasRunner
 from kiras_rl.schema import Config, LearnerConfig
-from kiras_rl.tools.timing import PartTimer, Times, interleave
+from kiras_rl.tools.benchmarks.request import Figures, Request
+from kiras_rl.tools.benchmarks.tables import make_table, verdict, with_range
+from kiras_rl.tools.benchmarks.training import ungated
+from kiras_rl.tools.timing import PartTimer, Times, interleave, ratios, summarise, wait_for
 
 STOCK, STOCK_SINGLE = "rsl-rl PPO", "rsl-rl PPO, 1-thread rollout"
 KIRAS = "KiRAS"
 REMOVABLE = ("imitation", "multi_critic", "estimator", "skill_init")
 """Blocks of `learner` that null removes."""
 
-_UNGATED = {"gate_update": "off", "both": "bootstrap_input"}
-"""AdaBoot modes -> the same without withheld updates: the price is that of a full iteration."""
-
-
-@dataclass(frozen=True)
-class LearningTimes:
-    """Seconds of an iteration (rollout and update), and of its update alone."""
-
-    iterations: Times
-    updates: Times
+TARGET = 1.3  # iterations of stock rsl-rl PPO
 
 
 class StockView(VecEnv):
@@ -65,13 +61,14 @@ def _select(obs: TensorDict) -> TensorDict:
     return obs.select(names.PROPRIO, names.HISTORY, names.CRITIC)
 
 
-def measure_learning(config: Config, rounds: int, device: str) -> LearningTimes:
+def measure(request: Request) -> Figures:
     """Time iterations of every learner on one environment, from the same states.
 
     Raises:
         ConfigError: As `make_env`.
         RobotError: As `make_env`.
     """
+    config, device = request.config, request.device
     env = make_env(config, device)
     bench = _LearningBench(env, device)
     bench.add(STOCK, lambda: _make_stock(env, config, device), _iterate_stock)
@@ -79,7 +76,50 @@ def measure_learning(config: Config, rounds: int, device: str) -> LearningTimes:
     for name, learner in _learners(config.learner).items():
         variant = replace(config, learner=learner)
         bench.add(name, lambda v=variant: KirasRunner(env, v, None, device), lambda r: r._iterate())
-    return bench.measure(rounds)
+    times, updates = bench.measure(request.rounds)
+    stock = min(STOCK, STOCK_SINGLE, key=lambda name: median(times[name]))
+    return {
+        "worlds": config.num_envs,
+        "num_steps": config.learner.ppo.num_steps,
+        "seconds_per_iteration": {name: summarise(t) for name, t in times.items()},
+        "seconds_per_update": {name: summarise(t) for name, t in updates.items()},
+        "reference": stock,
+        "times_reference": {name: summarise(ratios(times, name, stock)) for name in times},
+        "target": TARGET,
+        "price_seconds": _prices(times),
+        "rounds": {"iterations": times, "updates": updates},
+    }
+
+
+def _prices(times: Times) -> dict[str, float]:
+    """Return how much longer an iteration with a part takes than without, the median, s."""
+    return {
+        part: median(a - b for a, b in zip(times[KIRAS], times[without(part)], strict=True))
+        for part in REMOVABLE
+        if without(part) in times
+    }
+
+
+def table(figures: Figures) -> list[Table]:
+    """Return the comparison of learners, and the price of each part of KiRAS."""
+    title = f"iterations of {figures['worlds']} worlds x {figures['num_steps']} steps"
+    learners = make_table(title, "s", "update, s", "ratio", "range")
+    for name, seconds in figures["seconds_per_iteration"].items():
+        update = figures["seconds_per_update"][name]["median"]
+        against = with_range(figures["times_reference"][name])
+        learners.add_row(name, f"{seconds['median']:.3f}", f"{update:.3f}", *against)
+    reached = figures["times_reference"][KIRAS]["median"]
+    target = f"reference: {figures['reference']}; target: at most {figures['target']}"
+    learners.caption = verdict(reached <= figures["target"], target)
+    return [learners, _price_list(figures)]
+
+
+def _price_list(figures: Figures) -> Table:
+    whole = figures["seconds_per_iteration"][KIRAS]["median"]
+    prices = make_table("price of a part of KiRAS", "s an iteration", "% of KiRAS")
+    for part, seconds in figures["price_seconds"].items():
+        prices.add_row(part, f"{seconds:+.3f}", f"{100 * seconds / whole:+.1f}")
+    return prices
 
 
 def without(part: str) -> str:
@@ -89,9 +129,7 @@ def without(part: str) -> str:
 
 def _learners(full: LearnerConfig) -> dict[str, LearnerConfig]:
     """Return KiRAS as configured, and without each part that it has."""
-    full = copy.deepcopy(full)
-    if full.estimator is not None:
-        full.estimator.adaboot = _UNGATED.get(full.estimator.adaboot, full.estimator.adaboot)
+    full = ungated(full)
     present = [part for part in REMOVABLE if getattr(full, part) is not None]
     return {KIRAS: full} | {without(part): replace(full, **{part: None}) for part in present}
 
@@ -122,25 +160,21 @@ class _LearningBench:
             timer.clear()
             begin = time.perf_counter()
             iterate(runner)
-            self._wait()
+            wait_for(self._device)
             seconds = time.perf_counter() - begin
             self._updates[name].append(timer.seconds["update"])
             return seconds
 
         self._runs[name] = run
 
-    def measure(self, rounds: int) -> LearningTimes:
-        """Time all of them."""
+    def measure(self, rounds: int) -> tuple[Times, Times]:
+        """Return the seconds of whole iterations, and of their updates alone."""
         iterations = interleave(self._runs, rounds)
         updates = {name: times[-rounds:] for name, times in self._updates.items()}
-        return LearningTimes(iterations, updates)
+        return iterations, updates
 
     def _restore(self) -> None:
         self._env.load_state_dict(copy.deepcopy(self._state))
-
-    def _wait(self) -> None:
-        if torch.device(self._device).type == "cuda":
-            torch.cuda.synchronize()
 
 
 def _iterate_stock(runner: OnPolicyRunner) -> None:

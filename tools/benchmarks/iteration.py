@@ -1,0 +1,129 @@
+"""Where the time of a training iteration goes, in each phase."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from statistics import median
+
+from matplotlib import colormaps
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from rich.table import Table
+
+from kiras_rl.phases import phases_of
+from kiras_rl.tools.benchmarks.request import Figures, Request
+from kiras_rl.tools.benchmarks.tables import make_table, save_figure
+from kiras_rl.tools.benchmarks.training import Training
+from kiras_rl.tools.benchmarks.workload import ENVIRONMENT_PARTS
+from kiras_rl.tools.timing import PartTimer, Times
+
+REST = "rest"
+PARTS = (
+    *(
+        (f"env.{owner}" if owner else "env", method, part)
+        for owner, method, part in ENVIRONMENT_PARTS
+    ),
+    ("alg", "act", "act"),
+    ("alg", "process_env_step", "record"),
+    ("alg.imitation", "record", "imitation scoring"),
+    ("alg.imitation.selector", "record", "premium windows"),
+    ("alg.reference", "record", "residual reward"),
+    ("alg", "compute_returns", "returns"),
+    ("alg", "_update_policy", "policy update"),
+    ("alg.estimation", "update", "estimator"),
+    ("alg.imitation", "update", "discriminator"),
+)
+"""(owner, method, part): what an iteration is divided into; what is none of them is the rest."""
+
+
+def measure(request: Request) -> Figures:
+    """Time the parts of an iteration of every phase.
+
+    Raises:
+        ConfigError: As `make_env`.
+        RobotError: As `make_env`.
+    """
+    phases = {phase: _time_parts(request, phase) for phase in phases_of(request.config)}
+    return {
+        "worlds": request.config.num_envs,
+        "num_steps": request.config.learner.ppo.num_steps,
+        "device": request.device,
+        "seconds": {
+            phase: {part: median(times) for part, times in parts.items()}
+            for phase, parts in phases.items()
+        },
+        "rounds": phases,
+    }
+
+
+def _time_parts(request: Request, phase: str) -> Times:
+    """Return the seconds of each part of an iteration, one a round."""
+    training = Training(request.config, request.device, phase)
+    timer = PartTimer(request.device)
+    timer.wrap_all(training.runner, PARTS)
+    times: Times = {part: [] for part in (*timer.seconds, REST)}
+    training.iterate()  # warms up
+    for _ in range(request.rounds):
+        timer.clear()
+        whole = training.iterate()
+        for part, seconds in timer.seconds.items():
+            times[part].append(seconds)
+        times[REST].append(whole - sum(timer.seconds.values()))
+    return times
+
+
+def table(figures: Figures) -> list[Table]:
+    """Return a table of all parts, one column a phase."""
+    phases = figures["seconds"]
+    title = f"an iteration of {figures['worlds']} worlds x {figures['num_steps']} steps"
+    columns = [text for phase in phases for text in (f"{_words(phase)}, s", "%")]
+    parts = make_table(f"{title} on {figures['device']}", *columns)
+    for part in _parts_of(figures):
+        row = []
+        for seconds in phases.values():
+            share = 100 * seconds.get(part, 0.0) / sum(seconds.values())
+            row += [f"{seconds[part]:.3f}", f"{share:.1f}"] if part in seconds else ["", ""]
+        parts.add_row(part, *row)
+    whole = [text for s in phases.values() for text in (f"{sum(s.values()):.3f}", "100.0")]
+    parts.add_row("iteration", *whole)
+    return [parts]
+
+
+def _parts_of(figures: Figures) -> list[str]:
+    """Return the parts that any phase has, in their order."""
+    present = {part for seconds in figures["seconds"].values() for part in seconds}
+    return [part for part in (*(part for *_, part in PARTS), REST) if part in present]
+
+
+def plot(figures: Figures, path: Path) -> None:
+    """Draw a bar of an iteration's parts for each phase."""
+    phases = figures["seconds"]
+    figure = Figure(figsize=(11, 1.9 + 0.8 * len(phases)), layout="constrained")
+    axes = figure.subplots()
+    colors = dict(zip(_parts_of(figures), colormaps["tab20"].colors, strict=False))
+    for row, seconds in enumerate(phases.values()):
+        _stack(axes, row, seconds, colors)
+    axes.set_yticks(range(len(phases)), [_words(phase) for phase in phases])
+    axes.invert_yaxis()
+    axes.set_xlabel(
+        f"seconds of an iteration: {figures['worlds']} worlds x {figures['num_steps']} steps, "
+        f"{figures['device']}"
+    )
+    handles, labels = axes.get_legend_handles_labels()
+    legend = dict(zip(labels, handles, strict=True))
+    figure.legend(legend.values(), legend, loc="outside lower center", ncols=6, frameon=False)
+    save_figure(figure, path)
+
+
+def _stack(axes: Axes, row: int, seconds: dict[str, float], colors: dict[str, tuple]) -> None:
+    left, whole = 0.0, sum(seconds.values())
+    for part, width in seconds.items():
+        axes.barh(row, width, left=left, color=colors[part], label=part, height=0.6)
+        if width > 0.04 * whole:  # less has no room for a number
+            text = f"{100 * width / whole:.0f} %"
+            axes.text(left + width / 2, row, text, ha="center", va="center")
+        left += width
+
+
+def _words(phase: str) -> str:
+    return phase.replace("_", " ")
