@@ -26,6 +26,7 @@ from kiras_rl.tools.benchmarks import (
     inference,
     iteration,
     learning,
+    options,
     peer,
     physics,
     scale,
@@ -59,6 +60,8 @@ Only when they are named with --parts, because they take long:
 
 scale      speed and memory of the environment from 256 worlds upwards, doubled until memory is
            short; then of one size on terrain, without height_scan, and with 1, 5 and 10 skills
+options    speed against accuracy of MuJoCo's options, on walks of the policy that comes with the
+           robot. Always the native backend on the CPU.
 peer       the Go1 of this project beside mjlab's; needs --peer, which also adds this part
 """
 
@@ -82,6 +85,7 @@ PARTS: dict[str, ModuleType] = {
     "bound": bound,
     "inference": inference,
     "scale": scale,
+    "options": options,
     "peer": peer,
 }
 USUAL = ("physics", "terrain", "learning", "iteration", "bound", "inference")

@@ -148,6 +148,32 @@ def test_the_bound_is_physics_and_the_arithmetic_of_the_update(bench):
     assert "target: at least 0.85" in out
 
 
+def test_a_finer_time_step_is_nearer_to_the_reference(bench, tmp_path):
+    options = bench("--parts=options")[0]["options"]
+    errors, fine = options["errors"], "timestep 0.0025 s x 8"
+    assert options["speed"]["configuration"]["median"] == 1.0
+    for key in ("base_position", "base_height", "pitch", "foot_force"):
+        assert errors["reference"][key] == [0.0, 0.0]
+        assert 0.0 < errors[fine][key][0] < errors["configuration"][key][0]
+    # what a sphere of 16 mm can do without passing through the ground
+    assert 0.0 < errors["configuration"]["penetration"] < 0.016
+    assert "* configuration" in (tmp_path / "tables.txt").read_text()
+
+
+def test_options_need_a_policy_that_comes_with_the_robot(capsys):
+    assert main([*SMALL, "--parts=options", "--cfg=go1"]) == 2
+    assert "no policy comes with go1" in capsys.readouterr().err
+
+
+def test_an_option_is_varied_once_and_the_choice_is_not_repeated(bench):
+    options = bench("--parts=options", "sim.solver_iterations=6")[0]["options"]["options"]
+    assert options["configuration"]["iterations"] == options["configuration"]["ls_iterations"] == 6
+    assert "iterations 6" not in options
+    assert options["iterations 10"] == options["configuration"] | {"iterations": 10}
+    assert options["timestep 0.004 s x 5"] == options["configuration"] | {"substeps": 5}
+    assert options["reference"]["substeps"] == 20  # of 1 ms in 20 ms
+
+
 @pytest.mark.slow
 def test_worlds_are_added_until_memory_is_short(bench, tmp_path):
     sizes = "--worlds=4,8,1000000000"
