@@ -42,6 +42,9 @@ class Curriculum:
         self.kind = torch.searchsorted(edges, middle.double()).clamp(max=len(library.types) - 1)
         flat = library.types.index("flat") if "flat" in library.types else -1
         self.is_flat = self.kind == flat
+        of_type = self.kind == torch.arange(len(library.types), device=device)[:, None]
+        groups = torch.cat([of_type, ~self.is_flat[None]]).float()  # (types + 1, N)
+        self._mean_of = groups / groups.sum(1, keepdim=True).clamp(min=1.0)
         drawn = torch.rand(n, num_skills, generator=random.generator, device=device)
         self.level = (drawn * (min(start_level, library.levels - 1) + 1)).long()
         self._way = torch.zeros(n, device=device)
@@ -102,14 +105,13 @@ class Curriculum:
 
     def describe(self, skills: tuple[str, ...]) -> dict[str, torch.Tensor]:
         """Return by log name mean levels of types and skills, and shares of success by level."""
-        level = self.level.float()
-        log = {}
-        for index, name in enumerate(self._library.types):
-            mine = (self.kind == index).float()
-            log[f"Terrain/level_{name}"] = (level.mean(1) * mine).sum() / mine.sum().clamp(min=1)
-        rough = (~self.is_flat).float()[:, None]
-        by_skill = (level * rough).sum(0) / rough.sum().clamp(min=1)
-        log |= {f"Terrain/level_{k}": v for k, v in zip(skills, by_skill, strict=True)}
+        means = self._mean_of @ self.level.float()  # of each type and of all rough ones, by skill
+        by_type, by_skill = means[:-1].mean(1).unbind(), means[-1].unbind()
+        log = {
+            f"Terrain/level_{name}": mean
+            for names, values in ((self._library.types, by_type), (skills, by_skill))
+            for name, mean in zip(names, values, strict=True)
+        }
         shares = (self._crossings / self._tries.clamp(min=1.0)).unbind()
         return log | {f"Terrain/success_level_{k}": share for k, share in enumerate(shares)}
 

@@ -22,10 +22,12 @@ class Ground:
             return torch.tensor(values, dtype=dtype, device=device)
 
         self._edges, self._tops = table(library.edges), table(library.tops).flatten(1)
-        self._grid = table(library.grid, torch.int64)
+        self._inner = torch.nn.functional.pad(self._edges[:, :-1], (1, 0))
+        self._points, self._cell = library.grids.shape[1], library.cell
+        self._first = table(library.grid, torch.int64) * self._points**2
+        self._strides = table([1, self._points], torch.int64)
         self._heights = table(library.grids).flatten()
         self._spawn = table(library.spawn_height)
-        self._points, self._cell = library.grids.shape[1], library.cell
         self.tile = torch.zeros(num_worlds, dtype=torch.int64, device=device)
 
     def write(self, mask: torch.Tensor, tile: torch.Tensor) -> None:
@@ -46,30 +48,27 @@ class Ground:
         Returns:
             Heights, (N, P), m.
         """
-        x, y = points.nan_to_num(nan=2 * HALF).movedim(-1, 0).contiguous().unbind()
-        way = torch.maximum(x.abs(), y.abs())
-        height = torch.maximum(self._ring_tops(x, y, way), self._ground(x, y))
-        return torch.where(way <= HALF, height, 0.0).clamp(min=0.0)
+        points = points.nan_to_num(nan=2 * HALF)
+        way = points.abs()  # from the middle, along x and y
+        height = torch.maximum(self._ring_tops(points, way), self._ground(points))
+        return height.masked_fill(way.amax(-1) > HALF, 0.0).clamp(min=0.0)
 
-    def _ring_tops(self, x: torch.Tensor, y: torch.Tensor, way: torch.Tensor) -> torch.Tensor:
-        edges = self._edges[self.tile]
-        ring = torch.searchsorted(edges, way)  # the last edge is infinite
-        inner = edges.gather(1, (ring - 1).clamp(min=0)) * (ring > 0)
-        across = torch.where(y > 0, 2, 3)
-        side = torch.where(x > inner, 0, torch.where(x < -inner, 1, across))
+    def _ring_tops(self, points: torch.Tensor, way: torch.Tensor) -> torch.Tensor:
+        ring = torch.searchsorted(self._edges[self.tile], way.amax(-1))  # the last is infinite
+        inner = self._inner[self.tile].gather(1, ring)
+        is_west, is_south = (points <= 0).unbind(-1)
+        side = torch.where(way[..., 0] > inner, is_west, 2 + is_south)
         return self._tops[self.tile].gather(1, 4 * ring + side)
 
-    def _ground(self, x: torch.Tensor, y: torch.Tensor) -> torch.Tensor:
+    def _ground(self, points: torch.Tensor) -> torch.Tensor:
         """Interpolate on the triangles of MuJoCo: the cut goes from south-west to north-east."""
         last = self._points - 1
-        u = ((x + HALF) / self._cell).clamp(0.0, last)
-        v = ((y + HALF) / self._cell).clamp(0.0, last)
-        column, row = u.floor().clamp(max=last - 1), v.floor().clamp(max=last - 1)
-        u, v = u - column, v - row
-        corner = self._grid[self.tile, None] * self._points**2
-        corner = corner + row.long() * self._points + column.long()
+        uv = ((points + HALF) / self._cell).clamp(0.0, last)
+        cell = uv.floor().clamp(max=last - 1)
+        u, v = (uv - cell).unbind(-1)
+        corner = (cell.long() * self._strides).sum(-1) + self._first[self.tile, None]
         south_west, north_east = self._heights[corner], self._heights[corner + self._points + 1]
-        is_south = u > v
-        other = self._heights[corner + torch.where(is_south, 1, self._points)]
-        far, near = torch.where(is_south, u, v), torch.where(is_south, v, u)
+        # The third corner is the one in the east where u > v, else the one in the north.
+        other = self._heights[torch.where(u > v, corner + 1, corner + self._points)]
+        far, near = torch.maximum(u, v), torch.minimum(u, v)
         return south_west + far * (other - south_west) + near * (north_east - other)

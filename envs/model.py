@@ -33,6 +33,18 @@ class SensorLayout:
     limb_force_w: slice
     joint_torque: slice
 
+    @property
+    def forces_w(self) -> slice:
+        """Contact forces of feet, base and limbs, which follow each other."""
+        return slice(self.foot_force_w.start, self.limb_force_w.stop)
+
+    @property
+    def geoms(self) -> tuple[int, int, int]:
+        """Numbers of feet and of geoms of base and limbs, F, B and L."""
+        parts = (self.foot_force_w, self.base_force_w, self.limb_force_w)
+        feet, base, limbs = ((part.stop - part.start) // 3 for part in parts)
+        return feet, base, limbs
+
 
 @dataclass(frozen=True)
 class Scene:

@@ -9,7 +9,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
-from torch.nn.functional import one_hot
 
 from kiras_rl.config import ConfigError
 from kiras_rl.envs.lookup import find_function
@@ -95,7 +94,7 @@ def command_ang_vel_z(view: View) -> torch.Tensor:
 
 def skill(view: View) -> torch.Tensor:
     """Return the one-hot code of the commanded skill, S."""
-    return one_hot(view.task.skill, len(view.keyframes.height)).float()
+    return view.keyframes.code[view.task.skill]
 
 
 def joint_pos(view: View) -> torch.Tensor:

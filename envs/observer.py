@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import torch
 from tensordict import TensorDict
-from torch.nn.functional import one_hot
 
 from kiras_rl import interfaces as names
 from kiras_rl.envs.observations import ObservationGroup, View
@@ -68,7 +67,7 @@ class Observer:
             names.CRITIC: torch.cat([self.clean, self.critic(view)], dim=1),
             names.IMITATION: self.features,
             names.VELOCITY: view.robot.base_lin_vel_b,
-            names.SKILL: one_hot(task.skill, len(view.keyframes.height)).float(),
+            names.SKILL: view.keyframes.code[task.skill],
             names.COMMAND: task.command,
         }
         self.observation = TensorDict(

@@ -163,7 +163,8 @@ class QuadrupedEnv(SkillEnv):
         fallen = invalid | terminations.fallen(
             self.robot, self.task, self.keyframes, self.cfg.terminations
         )
-        crossed = self._crossed()
+        distance = self._distance()
+        crossed = (distance > CROSSED) & (self._ground is not None)  # flat ground has no end
         time_outs = ((self._length >= self.max_episode_length) | crossed) & ~fallen
         terms = self._judge(last_action, fallen, invalid)
         observer, view = self._observer, self._view()
@@ -175,7 +176,7 @@ class QuadrupedEnv(SkillEnv):
             names.NEXT_PROPRIO: _unless(invalid, observer.proprio(view), observer.clean),
             "log": self._log(terms, fallen, time_outs),
         }
-        self._measurements = measure(self.robot, self._distance(), fallen)
+        self._measurements = measure(self.robot, distance, fallen)
 
         done = fallen | time_outs
         if self._curriculum:
@@ -183,10 +184,6 @@ class QuadrupedEnv(SkillEnv):
             self._curriculum.update(done, fallen, crossed, self.task.skill)
         self._begin_next(done)
         return self._observe(done), terms.sum(dim=1), done, extras
-
-    def _crossed(self) -> torch.Tensor:
-        """Return which worlds have left their tile, (N,) bool; flat ground has no end."""
-        return (self._distance() > CROSSED) & (self._ground is not None)
 
     def _distance(self) -> torch.Tensor:
         """Return how far bases are from the middle of their tile, max(|x|, |y|), (N,), m."""
@@ -212,7 +209,7 @@ class QuadrupedEnv(SkillEnv):
             dt=self.step_dt,
         )
         terms = self._rewards(step)
-        return torch.where(invalid[:, None] & ~self._rewards.is_termination, 0.0, terms)
+        return terms.masked_fill(invalid[:, None] & ~self._rewards.is_termination, 0.0)
 
     def _begin_next(self, done: torch.Tensor) -> None:
         """Choose the next tasks, reset the worlds that ended and push some of the others."""
@@ -225,7 +222,7 @@ class QuadrupedEnv(SkillEnv):
         self._reset_worlds(done, self.task.start)
         push, velocity = self._randomizer.pushes(self.step_dt)
         qvel = self.sim.qvel.clone()
-        qvel[:, :2] += velocity
+        qvel[:, :2].add_(velocity)
         self.sim.write_velocity(push & ~done, qvel)
         self._read_begin()
 
@@ -248,8 +245,8 @@ class QuadrupedEnv(SkillEnv):
         self.sim.write_state(mask, qpos, qvel, joint_pos)
         # The targets that hold the start pose: what was "commanded" before the episode.
         self._action = torch.where(mask[:, None], self._postures.holding(joint_pos), self._action)
-        self._last_joint_torque = torch.where(mask[:, None], 0.0, self._last_joint_torque)
-        self._length = torch.where(mask, 0, self._length)
+        self._last_joint_torque = self._last_joint_torque.masked_fill(mask[:, None], 0.0)
+        self._length = self._length.masked_fill(mask, 0)
 
     def _write_terrain(self, mask: torch.Tensor, tile: torch.Tensor) -> None:
         self._ground.write(mask, tile)
@@ -271,10 +268,9 @@ class QuadrupedEnv(SkillEnv):
         log = {
             f"Reward/{name}": mean for name, mean in zip(self._rewards.names, means, strict=True)
         }
-        log["Episode/falls"] = fallen.float().sum()
-        log["Episode/time_outs"] = time_outs.float().sum()
-        log["Sim/diverged"] = self.sim.diverged.float().sum()
-        log["Sim/overflowed"] = self.sim.overflowed.float().sum()
+        events = torch.stack([fallen, time_outs, self.sim.diverged, self.sim.overflowed], dim=1)
+        counts = events.sum(dim=0, dtype=torch.float32).unbind()
+        log |= zip(_EVENTS, counts, strict=True)
         log["Perf/physics_time"] = torch.tensor(self._physics_time)
         return log | (self._curriculum.describe(self.skills) if self._curriculum else {})
 
@@ -388,6 +384,7 @@ class QuadrupedEnv(SkillEnv):
         self.robot.read_kinematics()
 
 
+_EVENTS = ("Episode/falls", "Episode/time_outs", "Sim/diverged", "Sim/overflowed")
 _BUFFERS = ("_length", "_action", "_last_joint_vel", "_last_joint_torque")
 
 

@@ -38,6 +38,9 @@ class Randomizer:
             return values.expand(sim.num_worlds, *values.shape)
 
         self._friction = nominal("geom_friction")
+        slides = torch.zeros(model.ngeom, 3, dtype=torch.bool)
+        slides[scene.robot_geoms, 0] = True
+        self._slides = slides.to(sim.device)
         self._mass, self._com = nominal("body_mass"), nominal("body_ipos")
         self._gain, self._bias = nominal("actuator_gainprm"), nominal("actuator_biasprm")
         self._delay = nominal("actuator_delay")
@@ -69,17 +72,17 @@ class Randomizer:
         return None if limits is None else scale_to(self._random[column], *limits)
 
     def _write_friction(self, mask: torch.Tensor, friction: torch.Tensor) -> None:
-        values = self._friction.clone()
-        values[:, self._scene.robot_geoms, 0] = friction  # (N, 1) on every geom of the robot
+        # (N, 1) on every geom of the robot; by a mask: a list of them would be copied to the GPU
+        values = torch.where(self._slides, friction[..., None], self._friction)
         self._sim.write_field("geom_friction", mask, values)
 
     def _write_base(self, mask: torch.Tensor) -> None:
         mass, com = self._mass.clone(), self._com.clone()
         base, config = self._scene.base_body, self._config
         if config.payload:
-            mass[:, base] += scale_to(self._random["payload"][:, 0], *config.payload)
+            mass[:, base].add_(scale_to(self._random["payload"][:, 0], *config.payload))
         if config.com_shift:
-            com[:, base] += scale_to(self._random["com_shift"], *config.com_shift)
+            com[:, base].add_(scale_to(self._random["com_shift"], *config.com_shift))
         self._sim.write_field("body_mass", mask, mass)
         self._sim.write_field("body_ipos", mask, com)
         self._sim.set_const(mask)
@@ -90,10 +93,10 @@ class Randomizer:
         kp = self._draw("kp_factor", self._config.kp_factor)
         kd = self._draw("kd_factor", self._config.kd_factor)
         if kp is not None:
-            gain[..., 0] *= kp
-            bias[..., 1] *= kp
+            gain[..., 0].mul_(kp)
+            bias[..., 1].mul_(kp)
         if kd is not None:
-            bias[..., 2] *= kd
+            bias[..., 2].mul_(kd)
         self._sim.write_field("actuator_gainprm", mask, gain)
         self._sim.write_field("actuator_biasprm", mask, bias)
 

@@ -2,43 +2,53 @@
 
 from __future__ import annotations
 
+import functools
+
+import numpy as np
 import torch
+from torch.nn.functional import normalize
 
 
-def projected_gravity(quat: torch.Tensor) -> torch.Tensor:
-    """Return the unit vector of gravity in the body frame.
+def matrix(quat: torch.Tensor) -> torch.Tensor:
+    """Return the rotations that express vectors of the body in the world.
+
+    Their entries are linear in the products of the quaternion's components: two operations make
+    all of them, which counts where each is a kernel launch.
 
     Args:
-        quat: Body orientation in the world, (N, 4).
+        quat: Unit quaternions, (N, 4).
+
+    Returns:
+        (N, 3, 3).
+    """
+    products = (quat[:, :, None] * quat[:, None, :]).flatten(1)
+    return (products @ _of_products(quat.device, quat.dtype)).unflatten(1, (3, 3))
+
+
+@functools.cache
+def _of_products(device: torch.device, dtype: torch.dtype) -> torch.Tensor:
+    """Return what each product adds to each entry of (w^2 - u.u) 1 + 2 u u' + 2 w [u]x, (16, 9)."""
+    one, terms = np.eye(3), np.zeros((4, 4, 3, 3))
+    terms[0, 0] = one
+    for i in range(3):
+        terms[1 + i, 1 + i] -= one
+        terms[1 + i, 1:, i] += 2.0 * one
+        terms[0, 1 + i] = 2.0 * np.cross(one[i], one).T
+    return torch.tensor(terms.reshape(16, 9), device=device, dtype=dtype)
+
+
+def projected_gravity(rotation: torch.Tensor) -> torch.Tensor:
+    """Return the unit vector of gravity in the body frame of rotations (N, 3, 3).
 
     Returns:
         (N, 3); (sin pitch, 0, -cos pitch) without roll.
     """
-    w, x, y, z = quat.unbind(-1)
-    return torch.stack(
-        [2.0 * (w * y - x * z), -2.0 * (y * z + w * x), 2.0 * (x * x + y * y) - 1.0], dim=-1
-    )
+    return -rotation[:, 2]
 
 
-def rotate_inverse(quat: torch.Tensor, vector: torch.Tensor) -> torch.Tensor:
-    """Express world vectors (N, 3) in the frames of `quat` (N, 4)."""
-    w, u = quat[:, :1], quat[:, 1:]
-    t = 2.0 * torch.linalg.cross(u, vector)
-    return vector - w * t + torch.linalg.cross(u, t)
-
-
-def rotate(quat: torch.Tensor, vector: torch.Tensor) -> torch.Tensor:
-    """Express vectors (N, ..., 3) of the frames of `quat` (N, 4) in the world."""
-    quat = quat.view(len(quat), *[1] * (vector.dim() - 2), 4)
-    w, u = quat[..., :1], quat[..., 1:].expand_as(vector)
-    t = 2.0 * torch.linalg.cross(u, vector)
-    return vector + w * t + torch.linalg.cross(u, t)
-
-
-def yaw(quat: torch.Tensor) -> torch.Tensor:
-    """Return the heading of the x axis of `quat` (N, 4), (N,), rad."""
-    w, x, y, z = quat.unbind(-1)
-    return torch.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+def yaw(rotation: torch.Tensor) -> torch.Tensor:
+    """Return the heading of the x axis of rotations (N, 3, 3), (N,), rad."""
+    return torch.atan2(rotation[:, 1, 0], rotation[:, 0, 0])
 
 
 def wrap(angle: torch.Tensor) -> torch.Tensor:
@@ -53,21 +63,18 @@ def turn(points: torch.Tensor, yaw: torch.Tensor) -> torch.Tensor:
     return torch.stack([cos * x - sin * y, sin * x + cos * y], dim=-1)
 
 
-def to_heading_frame(quat: torch.Tensor, vector: torch.Tensor) -> torch.Tensor:
-    """Rotate world vectors (N, 3) by minus the yaw of `quat` (N, 4)."""
-    w, x, y, z = quat.unbind(-1)
-    cos, sin = 1.0 - 2.0 * (y * y + z * z), 2.0 * (w * z + x * y)
-    norm = torch.sqrt(cos * cos + sin * sin).clamp(min=1e-6)
-    cos, sin = cos / norm, sin / norm
-    vx, vy, vz = vector.unbind(-1)
-    return torch.stack([cos * vx + sin * vy, cos * vy - sin * vx, vz], dim=-1)
+def to_heading_frame(rotation: torch.Tensor, vector: torch.Tensor) -> torch.Tensor:
+    """Rotate world vectors (N, 3) by minus the yaw of rotations (N, 3, 3)."""
+    cos, sin = normalize(rotation[:, :2, 0], eps=1e-6).unbind(-1)
+    x, y, z = vector.unbind(-1)
+    return torch.stack([cos * x + sin * y, cos * y - sin * x, z], dim=-1)
 
 
 def roll_pitch(gravity_b: torch.Tensor) -> torch.Tensor:
     """Return roll and pitch (nose down positive) from projected gravity, (N, 2), rad."""
-    roll = torch.atan2(-gravity_b[:, 1], -gravity_b[:, 2])
+    _, y, z = (-gravity_b).unbind(-1)
     pitch = torch.asin(gravity_b[:, 0].clamp(-1.0, 1.0))
-    return torch.stack([roll, pitch], dim=-1)
+    return torch.stack([torch.atan2(y, z), pitch], dim=-1)
 
 
 def quat_from_pitch_yaw(pitch: torch.Tensor, yaw: torch.Tensor) -> torch.Tensor:

@@ -76,12 +76,13 @@ class RobotState:
         """Read what follows from positions and velocities alone."""
         qpos, qvel = self._sim.qpos, self._sim.qvel
         self.base_pos_w = qpos[:, :3]  # (N, 3), m
-        self.base_quat_w = quat = qpos[:, 3:7]  # (N, 4)
+        self.base_quat_w = qpos[:, 3:7]  # (N, 4)
+        self._rotation = rotation = rotations.matrix(self.base_quat_w)  # base to world, (N, 3, 3)
         self.base_height = self._height_above_ground()  # of the base's origin, (N,), m
         self.base_ang_vel_b = qvel[:, 3:6]  # (N, 3), rad/s
-        self.base_lin_vel_b = rotations.rotate_inverse(quat, qvel[:, :3])  # (N, 3), m/s
-        self.base_lin_vel_h = rotations.to_heading_frame(quat, qvel[:, :3])  # (N, 3), m/s
-        self.gravity_b = rotations.projected_gravity(quat)  # (N, 3), unit vector
+        self.base_lin_vel_b = (qvel[:, None, :3] @ rotation).squeeze(1)  # (N, 3), m/s
+        self.base_lin_vel_h = rotations.to_heading_frame(rotation, qvel[:, :3])  # (N, 3), m/s
+        self.gravity_b = rotations.projected_gravity(rotation)  # (N, 3), unit vector
         self.roll_pitch = rotations.roll_pitch(self.gravity_b)  # (N, 2), rad
         # Rotation about the vertical, (N,), rad/s
         self.yaw_rate = -(self.gravity_b * self.base_ang_vel_b).sum(-1)
@@ -100,7 +101,7 @@ class RobotState:
     @property
     def yaw(self) -> torch.Tensor:
         """Heading of the base, (N,), rad."""
-        return rotations.yaw(self.base_quat_w)
+        return rotations.yaw(self._rotation)
 
     def height_scan(self) -> torch.Tensor:
         """Return how far the base is above SCAN_SHAPE points around it, (N, points), m.
@@ -124,17 +125,18 @@ class RobotState:
         if self._ground is None:
             return torch.zeros_like(self.base_pos_w[:, :1])
         pos_b = self._kinematics.foot_pos_b(self.joint_pos)
-        points = self.base_pos_w[:, None] + rotations.rotate(self.base_quat_w, pos_b)
+        points = self.base_pos_w[:, None] + pos_b @ self._rotation.mT
         return self._ground.heights(points[..., :2])
 
     def _read_contacts(self) -> None:
         record, layout = self._sim.sensor_record, self._layout
+        squared = _squared_norms(record[:, :, layout.forces_w])  # (N, K, geoms), N^2
         # Largest force of the physics steps, so that no short contact is missed, (N, ...), N
-        self.foot_force = _peak_force(record[:, :, layout.foot_force_w])
-        self.base_force = _peak_force(record[:, :, layout.base_force_w])
-        self.limb_force = _peak_force(record[:, :, layout.limb_force_w])
+        peaks = squared.amax(dim=1).sqrt()
+        self.foot_force, self.base_force, self.limb_force = peaks.split(layout.geoms, dim=1)
+        feet = squared[:, -1, : layout.geoms[0]]
+        self.foot_contact = feet > CONTACT_FORCE**2  # (N, F) bool
         last = record[:, -1]
-        self.foot_contact = _force(last[:, layout.foot_force_w]) > CONTACT_FORCE  # (N, F) bool
         self.foot_vel_w = last[:, layout.foot_vel_w].unflatten(1, (-1, 3))  # (N, F, 3), m/s
         self.joint_torque = last[:, layout.joint_torque]  # (N, J), N m
 
@@ -172,12 +174,14 @@ class Keyframes:
         pitch: Nose down positive, (S,), rad.
         joint_pos: (S, J), rad.
         gravity_b: Projected gravity, (S, 3).
+        code: One-hot code of each, (S, S).
     """
 
     height: torch.Tensor
     pitch: torch.Tensor
     joint_pos: torch.Tensor
     gravity_b: torch.Tensor
+    code: torch.Tensor
 
     @classmethod
     def of(cls, robot: Robot, device: torch.device) -> Keyframes:
@@ -193,6 +197,7 @@ class Keyframes:
             pitch=pitch,
             joint_pos=tensor([list(k.joint_pos) for k in robot.keyframes]),
             gravity_b=torch.stack([torch.sin(pitch), zero, -torch.cos(pitch)], dim=-1),
+            code=torch.eye(len(pitch), device=device),
         )
 
 
@@ -234,17 +239,8 @@ def grid(rows: int, columns: int, spacing: float) -> torch.Tensor:
     return torch.cartesian_prod(x, y)
 
 
-def _force(flat: torch.Tensor) -> torch.Tensor:
-    """Return magnitudes of the forces in (..., 3 G), as (..., G)."""
-    return _squared_force(flat).sqrt()
-
-
-def _peak_force(record: torch.Tensor) -> torch.Tensor:
-    """Return the largest magnitude over the physics steps of (N, K, 3 G), as (N, G)."""
-    return _squared_force(record).amax(dim=1).sqrt()
-
-
-def _squared_force(flat: torch.Tensor) -> torch.Tensor:
+def _squared_norms(flat: torch.Tensor) -> torch.Tensor:
+    """Return the squared lengths of the vectors in (..., 3 G), as (..., G)."""
     # Written out: a CPU takes several times as long to reduce over three numbers.
     x, y, z = flat.unflatten(-1, (-1, 3)).unbind(-1)
     return x * x + y * y + z * z

@@ -192,7 +192,9 @@ class WarpSimulation:
         self._read_warnings()
 
     def _read_warnings(self) -> None:
-        sound = _sound(self.qpos) & _sound(self.qvel) & _sound(self._ctrl)
+        values = torch.cat([self.qpos, self.qvel, self._ctrl], dim=1)
+        # What MuJoCo itself would not call bad; NaN is neither less nor more
+        sound = (values.abs() <= mujoco.mjMAXVAL).all(1)
         torch.logical_not(sound, out=self.diverged)
         torch.ne(self._overflow & _OVERFLOW, 0, out=self.overflowed)
         self._monitor.record(self._overflow)
@@ -222,12 +224,14 @@ class WarpSimulation:
 
     def set_const(self, mask: torch.Tensor) -> None:
         """Recompute the constants that depend on masses in the masked worlds."""
-        if self.device.type == "cpu" and not mask.any():  # on CUDA the question would cost a wait
+        # On CUDA the question would cost a wait.
+        if self.device.type == "cpu" and not mask.numpy().any():
             return
         before = {name: x.clone() for name, x in self._constants.items()}
         self._set_const()  # of every world
+        others = ~mask
         for name, x in self._constants.items():
-            _write(x, ~mask, before[name])
+            _write(x, others, before[name])
 
     def write_terrain(self, mask: torch.Tensor, tile: torch.Tensor) -> None:
         """Show a tile in the masked worlds."""
@@ -313,12 +317,7 @@ def _garbage_kept() -> Iterator[None]:
             gc.enable()
 
 
-def _sound(values: torch.Tensor) -> torch.Tensor:
-    """Return the worlds that MuJoCo itself would not call bad, (N, k) -> (N,) bool."""
-    return (values.abs() <= mujoco.mjMAXVAL).all(1)  # NaN is not
-
-
 def _write(target: torch.Tensor, mask: torch.Tensor, values: torch.Tensor) -> None:
     """Copy the masked rows of `values` into `target`, (N, ...), without asking which they are."""
     mask = mask.view(-1, *[1] * (target.dim() - 1))
-    target.copy_(torch.where(mask, values, target))
+    torch.where(mask, values, target, out=target)

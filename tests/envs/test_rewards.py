@@ -20,6 +20,7 @@ KEYFRAMES = Keyframes(
     pitch=torch.zeros(2),
     joint_pos=torch.tensor([[0.5, -1.0], [1.0, -2.0]]),
     gravity_b=torch.tensor([[0.0, 0.0, -1.0], [0.0, 0.0, -1.0]]),
+    code=torch.eye(2),
 )
 
 

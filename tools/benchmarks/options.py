@@ -292,7 +292,7 @@ def _differences(
 def _pitch(qpos: np.ndarray) -> np.ndarray:
     """Return the pitch of (T, N, nq), (T, N), rad."""
     quat = torch.from_numpy(qpos[..., 3:7].reshape(-1, 4))
-    pitch = rotations.roll_pitch(rotations.projected_gravity(quat))[:, 1]
+    pitch = rotations.roll_pitch(rotations.projected_gravity(rotations.matrix(quat)))[:, 1]
     return pitch.numpy().reshape(qpos.shape[:2])
 
 
