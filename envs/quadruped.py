@@ -88,6 +88,7 @@ class QuadrupedEnv(SkillEnv):
         self._action = torch.zeros(n, self.num_actions, device=device)
         self._last_joint_vel = torch.zeros(n, self.num_actions, device=device)
         self._last_joint_torque = torch.zeros(n, self.num_actions, device=device)
+        self._air_time = torch.zeros(n, len(robot.foot_geoms), device=device)
         self._measurements: Measurements | None = None
         self._kinematics = FootKinematics(self.scene.model, robot, device)
         self.robot = RobotState(self.sim, self.scene.sensors, self._kinematics, self._ground)
@@ -204,6 +205,7 @@ class QuadrupedEnv(SkillEnv):
             last_action=last_action,
             last_joint_vel=self._last_joint_vel,
             last_joint_torque=self._last_joint_torque,
+            air_time=self._air_time,
             fresh=self._length == 1,
             fallen=fallen,
             dt=self.step_dt,
@@ -219,6 +221,7 @@ class QuadrupedEnv(SkillEnv):
                 self._curriculum.note_switches((task.skill != self.task.skill) & ~done)
             self.task = task
         self._last_joint_torque = self.robot.joint_torque.clone()
+        self._air_time = (self._air_time + self.step_dt) * ~self.robot.foot_contact
         self._reset_worlds(done, self.task.start)
         push, velocity = self._randomizer.pushes(self.step_dt)
         qvel = self.sim.qvel.clone()
@@ -236,16 +239,15 @@ class QuadrupedEnv(SkillEnv):
         """Put the masked worlds into the keyframes `start`, (N,), with new physics and ground."""
         self._randomizer.reset(mask)
         if self._curriculum:
-            placed = self._placed is not None
-            self._write_terrain(
-                mask, self._placed if placed else self._curriculum.tiles(self.task.skill)
-            )
+            tile = self._curriculum.tiles(self.task.skill) if self._placed is None else self._placed
+            self._write_terrain(mask, tile)
         qpos, qvel = self._postures.draw_begin(start, self._random)
         joint_pos = qpos[:, 7:]
         self.sim.write_state(mask, qpos, qvel, joint_pos)
         # The targets that hold the start pose: what was "commanded" before the episode.
         self._action = torch.where(mask[:, None], self._postures.holding(joint_pos), self._action)
         self._last_joint_torque = self._last_joint_torque.masked_fill(mask[:, None], 0.0)
+        self._air_time = self._air_time.masked_fill(mask[:, None], 0.0)
         self._length = self._length.masked_fill(mask, 0)
 
     def _write_terrain(self, mask: torch.Tensor, tile: torch.Tensor) -> None:
@@ -375,8 +377,8 @@ class QuadrupedEnv(SkillEnv):
         self._held = state["held"]
         self.set_skill_probabilities(state["probabilities"])
         self._random.generator.set_state(state["generator"].cpu())
-        for name in _BUFFERS:
-            setattr(self, name, state["buffers"][name].to(self.device))
+        for name, buffer in state["buffers"].items():
+            setattr(self, name, buffer.to(self.device))
         self._observer.load_state_dict(state["observer"])
         if self._curriculum:
             self._curriculum.load_state_dict(state["curriculum"])
@@ -385,7 +387,7 @@ class QuadrupedEnv(SkillEnv):
 
 
 _EVENTS = ("Episode/falls", "Episode/time_outs", "Sim/diverged", "Sim/overflowed")
-_BUFFERS = ("_length", "_action", "_last_joint_vel", "_last_joint_torque")
+_BUFFERS = ("_length", "_action", "_last_joint_vel", "_last_joint_torque", "_air_time")
 
 
 def _unless(mask: torch.Tensor, new: torch.Tensor, old: torch.Tensor) -> torch.Tensor:

@@ -98,6 +98,15 @@ def foot_clearance(step: Step, height: float) -> torch.Tensor:
     return (missing * speed).sum(-1)
 
 
+def feet_air_time(step: Step, target: float) -> torch.Tensor:
+    """Return by how much the feet that land now were in the air longer than `target`, summed, s.
+
+    Short steps cost, long ones earn; a robot that is asked to stand is left alone.
+    """
+    landing = step.robot.foot_contact & (step.air_time > 0.0)
+    return ((step.air_time - target) * landing).sum(-1) * ~_standing(step)
+
+
 def feet_drag(step: Step) -> torch.Tensor:
     """Return minus the summed |v_x| + |v_y| of the standing feet, m/s (weight +0.5 [paper])."""
     speed = step.robot.foot_vel_w[..., :2].abs().sum(-1)

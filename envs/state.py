@@ -214,6 +214,8 @@ class Step:
             one that holds the start pose.
         last_joint_vel: Before the step, (N, J), rad/s.
         last_joint_torque: Before the step, (N, J), N m.
+        air_time: How long each foot had been off the ground before the step, (N, F), s; zero for
+            feet that stood, and after a reset.
         fresh: Worlds in the first step of an episode, (N,) bool; `delta_torques` is zero there,
             for there is no torque of a step before.
         fallen: Worlds that terminate by failure, (N,) bool.
@@ -227,6 +229,7 @@ class Step:
     last_action: torch.Tensor
     last_joint_vel: torch.Tensor
     last_joint_torque: torch.Tensor
+    air_time: torch.Tensor
     fresh: torch.Tensor
     fallen: torch.Tensor
     dt: float

@@ -55,8 +55,10 @@ class KirasPPO(PPO):
             max_grad_norm=ppo.max_grad_norm,
             device=device,
         )
+        # On the device, as the KL divergence that it follows: no step of the update waits for it
+        self.learning_rate = torch.tensor(ppo.learning_rate, device=device)
         parameters = chain(parts.actor.parameters(), parts.critic.parameters())
-        self.optimizer = torch.optim.Adam(parameters, lr=ppo.learning_rate, fused=True)
+        self.optimizer = torch.optim.Adam(parameters, lr=self.learning_rate, fused=True)
         self.config = config
         self.iterations = iterations
         self.iteration = 0
@@ -71,11 +73,20 @@ class KirasPPO(PPO):
 
     # --- rollout --------------------------------------------------------------------------------
 
+    @torch.no_grad()
     def act(self, obs: TensorDict) -> torch.Tensor:
-        """Sample actions (N, J); the context is computed once, here, and stored with the step."""
+        """Sample actions (N, J); the context is computed once, here, and stored with the step.
+
+        Values are not needed before the rollout is over: `compute_returns` asks the critics once.
+        """
         if self.estimation:
             obs[names.CONTEXT] = self.estimation.context(obs)
-        return super().act(obs)
+        step, actor = self.transition, self.actor
+        step.observations = obs
+        step.actions = actor(obs, stochastic_output=True)
+        step.actions_log_prob = actor.get_output_log_prob(step.actions)
+        step.distribution_params = actor.output_distribution_params
+        return step.actions
 
     def act_deterministic(self, obs: TensorDict) -> torch.Tensor:
         """Return mean actions (N, J) as the exported policy computes them."""
@@ -101,40 +112,44 @@ class KirasPPO(PPO):
         step = self.transition
         before = step.observations
         before[names.NEXT_PROPRIO] = extras[names.NEXT_PROPRIO]
-        grouped = self._group_rewards(before, rewards, dones, extras)
-        # rsl-rl's convention: an episode cut by the clock goes on with the value where it began
-        time_outs = extras[names.EXTRA_TIME_OUTS].unsqueeze(1)
-        step.rewards = grouped + self.gamma * step.values * time_outs
-        step.dones = dones
+        step.rewards = rewards
+        if self.reference:
+            is_flat = extras[names.EXTRA_FLAT]
+            step.rewards = rewards + self.reference.record(before, step.actions, is_flat)
+        step.dones, step.time_outs = dones, extras[names.EXTRA_TIME_OUTS]
+        if self.imitation:
+            self.imitation.record(before, rewards, dones, extras)
         if self.estimation:
             self.estimation.record(rewards, dones)
         self.storage.add_transition(step)
         step.clear()
 
-    def _group_rewards(
-        self, before: TensorDict, rewards: torch.Tensor, dones: torch.Tensor, extras: dict
-    ) -> torch.Tensor:
-        """Return task and imitation rewards, (N, G); summed where there is one critic."""
-        task = rewards
-        if self.reference:
-            is_flat = extras[names.EXTRA_FLAT]
-            task = task + self.reference.record(before, self.transition.actions, is_flat)
-        task = task.clamp(min=0.0) if self.config.ppo.only_positive_rewards else task
-        if self.imitation is None:
-            return task.unsqueeze(1)
-        imitation = self.imitation.record(before, rewards, dones, extras)
-        if self.config.multi_critic is None:
-            return (task + imitation).unsqueeze(1)
-        return torch.stack([task, imitation], dim=1)
-
     def compute_returns(self, obs: TensorDict) -> None:
-        """Compute returns of each group and one mixed advantage."""
+        """Judge the rollout: values, imitation rewards, returns and one mixed advantage.
+
+        Args:
+            obs: Observation after the last step.
+        """
         st = self.storage
+        st.values = self.critic(st.observations)
+        # rsl-rl's convention: an episode cut by the clock goes on with the value where it began
+        st.rewards = self._group_rewards() + self.gamma * st.values * st.time_outs
         advantages = returns.generalized_advantages(
             st.rewards, st.values, self.critic(obs), st.dones, self.gamma, self.lam
         )
         st.returns = advantages + st.values
         st.advantages = returns.mix_advantages(advantages, self._weights(), self._std_floor())
+
+    def _group_rewards(self) -> torch.Tensor:
+        """Return task and imitation rewards, (T, N, G); summed where there is one critic."""
+        task = self.storage.task_rewards
+        task = task.clamp(min=0.0) if self.config.ppo.only_positive_rewards else task
+        if self.imitation is None:
+            return task
+        imitation = self.imitation.rewards().unsqueeze(-1)
+        if self.config.multi_critic is None:
+            return task + imitation
+        return torch.cat([task, imitation], dim=-1)
 
     def _weights(self) -> tuple[float, ...]:
         mix = self.config.multi_critic
@@ -187,7 +202,7 @@ class KirasPPO(PPO):
             "Loss/surrogate": surrogate,
             "Loss/value": value,
             "Policy/kl": kl,
-            "Policy/learning_rate": self.learning_rate,
+            "Policy/learning_rate": self.learning_rate.item(),
             "Policy/action_std": self.actor.output_std.mean().item(),
         }
 
@@ -220,11 +235,9 @@ class KirasPPO(PPO):
         """Adapt the learning rate to the mean KL divergence from the rollout's policy."""
         distribution = self.actor.distribution
         kl = distribution.kl_divergence(old_params, distribution.params).mean()
-        self.learning_rate = losses.adapt_learning_rate(
-            self.learning_rate, kl.item(), self.desired_kl, self.config.ppo.learning_rate_range
-        )
-        for group in self.optimizer.param_groups:
-            group["lr"] = self.learning_rate
+        limits = self.config.ppo.learning_rate_range
+        adapted = losses.adapt_learning_rate(self.learning_rate, kl, self.desired_kl, limits)
+        self.learning_rate.copy_(adapted)  # in place: the optimizer reads this tensor
         return kl
 
     def _apply_schedules(self) -> None:
@@ -301,7 +314,7 @@ class KirasPPO(PPO):
             self.estimation.estimator.load_state_dict(networks["estimator"])
         if self.reference:
             self.reference.policy.load_state_dict(self.policy().state_dict())
-        self.learning_rate = learner["learning_rate"]
+        self.learning_rate.fill_(learner["learning_rate"])
         if self.sampler and "skill_probabilities" in learner:
             self.sampler.probabilities = learner["skill_probabilities"].to(self.device)
         self._apply_schedules()
@@ -316,7 +329,7 @@ class KirasPPO(PPO):
         """Return every network, optimizer and statistic."""
         saved = super().save()
         saved["iteration"] = self.iteration
-        saved["learning_rate"] = self.learning_rate
+        saved["learning_rate"] = self.learning_rate.item()
         for name, part in self._parts().items():
             saved[name] = part.state_dict()
         if self.sampler:
@@ -327,7 +340,9 @@ class KirasPPO(PPO):
         """Load what `save` returned."""
         super().load(loaded_dict, load_cfg, strict)
         self.iteration = loaded_dict["iteration"]
-        self.learning_rate = loaded_dict["learning_rate"]
+        self.learning_rate.fill_(loaded_dict["learning_rate"])
+        for group in self.optimizer.param_groups:  # loading has replaced it by a copy
+            group["lr"] = self.learning_rate
         for name, part in self._parts().items():
             part.load_state_dict(loaded_dict[name])
         if self.sampler:

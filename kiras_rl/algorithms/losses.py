@@ -40,14 +40,19 @@ def retention_loss(
 
 
 def adapt_learning_rate(
-    rate: float, kl: float, desired_kl: float, limits: tuple[float, float]
-) -> float:
-    """Return a lower rate where the policy moved too far, a higher one where it hardly moved."""
-    if kl > 2.0 * desired_kl:
-        return max(limits[0], rate / 1.5)
-    if 0.0 < kl < desired_kl / 2.0:
-        return min(limits[1], rate * 1.5)
-    return rate
+    rate: torch.Tensor, kl: torch.Tensor, desired_kl: float, limits: tuple[float, float]
+) -> torch.Tensor:
+    """Return a lower rate where the policy moved too far, a higher one where it hardly moved.
+
+    Args:
+        rate: Step size, a number on the device.
+        kl: Divergence of the policy from that of the rollout, a number on the device.
+        desired_kl: What it should be.
+        limits: Of the step size.
+    """
+    slower, faster = (rate / 1.5).clamp(min=limits[0]), (rate * 1.5).clamp(max=limits[1])
+    hardly = (kl > 0.0) & (kl < desired_kl / 2.0)
+    return torch.where(kl > 2.0 * desired_kl, slower, torch.where(hardly, faster, rate))
 
 
 def discriminator_loss(

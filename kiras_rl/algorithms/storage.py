@@ -1,4 +1,4 @@
-"""Rollout storage whose rewards, values and returns have one column a reward group."""
+"""Rollout storage of what the learner can only judge when the rollout is over."""
 
 from __future__ import annotations
 
@@ -10,7 +10,11 @@ from tensordict import TensorDict
 
 
 class GroupRolloutStorage(RolloutStorage):
-    """rsl-rl's storage with G columns in rewards, values and returns."""
+    """rsl-rl's storage with G columns in rewards, values and returns.
+
+    A step brings its task reward alone. The learner judges whole rollouts, for one pass over all
+    steps costs less than one a step: it then sets `rewards`, `values`, `returns`, (T, N, G).
+    """
 
     def __init__(
         self,
@@ -23,21 +27,28 @@ class GroupRolloutStorage(RolloutStorage):
     ) -> None:
         """Allocate (T, N, ...) buffers."""
         super().__init__("rl", num_envs, num_steps, obs, [num_actions], device)
-        shape = (num_steps, num_envs, num_groups)
-        self.rewards = torch.zeros(shape, device=device)
-        self.values = torch.zeros(shape, device=device)
-        self.returns = torch.zeros(shape, device=device)
+        shape = (num_steps, num_envs)
+        self.task_rewards = torch.zeros(*shape, 1, device=device)
+        self.time_outs = torch.zeros(*shape, 1, dtype=torch.bool, device=device)
+        self.rewards = torch.zeros(*shape, num_groups, device=device)
+        self.values = torch.zeros(*shape, num_groups, device=device)
+        self.returns = torch.zeros(*shape, num_groups, device=device)
 
     def add_transition(self, transition: RolloutStorage.Transition) -> None:
-        """Add one step, whose rewards and values are (N, G)."""
+        """Add one step.
+
+        Args:
+            transition: `rewards` (N,) are of the task; `time_outs` (N,) tells which `dones` (N,)
+                are of the clock.
+        """
         if self.step >= self.num_transitions_per_env:
             raise OverflowError("the rollout is full: clear() the storage before adding to it")
         step = self.step
         self.observations[step].copy_(transition.observations)
         self.actions[step] = transition.actions
-        self.rewards[step] = transition.rewards
+        self.task_rewards[step] = transition.rewards.view(-1, 1)
         self.dones[step] = transition.dones.view(-1, 1)
-        self.values[step] = transition.values
+        self.time_outs[step] = transition.time_outs.view(-1, 1)
         self.actions_log_prob[step] = transition.actions_log_prob.view(-1, 1)
         if self.distribution_params is None:
             self.distribution_params = tuple(

@@ -78,16 +78,14 @@ class SelfImitation:
 
     def record(
         self, before: TensorDict, rewards: torch.Tensor, dones: torch.Tensor, extras: dict
-    ) -> torch.Tensor:
-        """Store a step and return its imitation reward, (N,).
+    ) -> None:
+        """Store a step.
 
         Both halves of a pair come from one episode: the second is Phi before the reset.
         """
         after, valid = extras[names.EXTRA_IMITATION], extras[names.EXTRA_VALID]
-        pair = torch.cat([before[names.IMITATION], after], dim=-1)
-        reward = self.config.reward_weight * imitation_reward(self.discriminator(pair)) * valid
-        self._pairs[self._step], self._valid[self._step] = pair, valid
-        self._rewards[self._step] = reward
+        torch.cat([before[names.IMITATION], after], dim=-1, out=self._pairs[self._step])
+        self._valid[self._step] = valid
         self._step += 1
         failed = dones.bool() & ~extras[names.EXTRA_TIME_OUTS]
         self.selector.record(
@@ -98,7 +96,13 @@ class SelfImitation:
             done=dones.bool(),
             valid=valid & ~failed,
         )
-        return reward
+
+    @torch.no_grad()
+    def rewards(self) -> torch.Tensor:
+        """Return the imitation reward of every step of the rollout, (T, N)."""
+        score = self.discriminator(self._pairs)
+        self._rewards = self.config.reward_weight * imitation_reward(score) * self._valid
+        return self._rewards
 
     def update(
         self, storage: GroupRolloutStorage, iteration: int, progress: float

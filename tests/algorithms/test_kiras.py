@@ -37,6 +37,16 @@ def collect(runner):
         runner.alg.compute_returns(obs)
 
 
+def test_the_step_size_that_is_logged_is_the_optimizer_s(make_runner):
+    runner = make_runner("learner.ppo.desired_kl=[[0,1.0e-12]]")  # any step is too far
+    runner.learn(1)
+    alg = runner.alg
+    assert alg.learning_rate < runner.config.learner.ppo.learning_rate
+    for _ in range(2):  # also after loading, which replaces what the optimizer holds
+        assert all(group["lr"] is alg.learning_rate for group in alg.optimizer.param_groups)
+        alg.load(copy.deepcopy(alg.save()))
+
+
 @pytest.mark.parametrize("without", [(), *[(part,) for part in PARTS], PARTS], ids="-".join)
 def test_it_trains_whatever_is_left_out(make_runner, without):
     runner, seen = make_runner(*null(*without)), []
@@ -83,7 +93,7 @@ def test_no_pair_of_features_straddles_a_reset(make_runner):
     )
     collect(runner)
     hook.remove()
-    before, after = torch.cat(pairs).chunk(2, dim=1)
+    before, after = torch.cat(pairs).flatten(0, 1).chunk(2, dim=1)
     assert after[:, 0].max() > 0  # some episodes did end
     assert torch.equal(before[:, 0], after[:, 0])  # the episode
     assert torch.equal(before[:, 1] + 1, after[:, 1])  # the step in it

@@ -54,8 +54,9 @@ def test_value_errors_are_averaged_over_the_batch_and_summed_over_groups():
     ],
 )
 def test_the_learning_rate_follows_the_divergence_within_limits(rate, kl, expected):
+    rate, kl = torch.tensor(rate), torch.tensor(kl)
     adapted = adapt_learning_rate(rate, kl, desired_kl=0.01, limits=(1e-4, 1e-3))
-    assert adapted == pytest.approx(expected)
+    assert adapted.item() == pytest.approx(expected)
 
 
 def test_the_discriminator_is_pulled_to_plus_and_minus_one():

@@ -17,9 +17,9 @@ def step(value):
     transition = GroupRolloutStorage.Transition()
     transition.observations = TensorDict({"a": number}, batch_size=[WORLDS])
     transition.actions = number.expand(-1, ACTIONS)
-    transition.rewards = torch.cat([number, -number], dim=1)
-    transition.values = torch.cat([10 * number, -10 * number], dim=1)
+    transition.rewards = number.squeeze(1)
     transition.dones = number.squeeze(1) > 1.2
+    transition.time_outs = number.squeeze(1) > 2.2
     transition.actions_log_prob = number.squeeze(1)
     transition.distribution_params = (number.expand(-1, ACTIONS), torch.ones(WORLDS, ACTIONS))
     return transition
@@ -31,16 +31,16 @@ def storage():
     return GroupRolloutStorage(WORLDS, STEPS, 2, obs, ACTIONS, "cpu")
 
 
-def test_every_group_has_its_column(storage):
+def test_every_step_has_its_row(storage):
     for t in range(STEPS):
         storage.add_transition(step(t))
     number = torch.arange(3.0)[:, None] + torch.arange(4.0) / 10
-    torch.testing.assert_close(storage.rewards, torch.stack([number, -number], dim=-1))
-    torch.testing.assert_close(storage.values, 10 * storage.rewards)
+    torch.testing.assert_close(storage.task_rewards, number[..., None])
     torch.testing.assert_close(storage.observations["a"], number[..., None])
     torch.testing.assert_close(storage.actions_log_prob, number[..., None])
     torch.testing.assert_close(storage.distribution_params[0], number[..., None].expand(3, 4, 2))
     assert storage.dones.squeeze(-1).int().tolist() == [[0] * 4, [0, 0, 0, 1], [1] * 4]
+    assert storage.time_outs.squeeze(-1).int().tolist() == [[0] * 4, [0] * 4, [0, 0, 0, 1]]
 
 
 def test_a_full_rollout_takes_no_more_until_it_is_cleared(storage):
@@ -50,7 +50,7 @@ def test_a_full_rollout_takes_no_more_until_it_is_cleared(storage):
         storage.add_transition(step(3))
     storage.clear()
     storage.add_transition(step(3))
-    assert storage.rewards[0, 0, 0] == 3.0
+    assert storage.task_rewards[0, 0, 0] == 3.0
 
 
 def test_shuffled_tensors_keep_their_rows_together(storage):

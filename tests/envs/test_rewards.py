@@ -53,6 +53,7 @@ def crafted(command=(0.5, 0.0, 0.2), fresh=False, fallen=False):
         last_action=row(-2.0, 6.0),
         last_joint_vel=row(0.5, 0.0),
         last_joint_torque=row(1.0, 1.0),
+        air_time=row(0.18, 0.5),
         fresh=torch.tensor([fresh]),
         fallen=torch.tensor([fallen]),
         dt=0.02,
@@ -79,6 +80,7 @@ EXPECTED = {
     "lin_vel_y": ({}, 0.01),
     "lin_vel_y_abs": ({}, 0.1),
     "foot_slip": ({}, 0.09 + 0.16),  # the second foot is in the air
+    "feet_air_time": ({"target": 0.1}, 0.08),  # the other foot is still in the air
     "feet_drag": ({}, -(0.3 + 0.4)),
     "foot_clearance": ({"height": 0.05}, 0.04 * 0.5),  # the other foot is high enough
     "feet_contact_forces": ({"threshold": 10.0, "largest": 20.0}, 20.0 + 2.0),
@@ -119,6 +121,10 @@ def test_standing_still_is_asked_for_by_a_small_command(command, stands):
     assert value("stand_still", step) == pytest.approx(0.6 + 0.4 if stands else 0.0)
     # from the keyframe of the commanded skill: (1, -2)
     assert value("stand_still_pose", step) == pytest.approx(0.3 + 0.3 if stands else 0.0)
+
+
+def test_feet_of_a_robot_that_stands_are_left_alone():
+    assert value("feet_air_time", crafted((0.0, 0.0, 0.0)), target=0.1) == 0.0
 
 
 def test_the_first_step_has_no_change_of_torque():

@@ -25,7 +25,7 @@ PARTS = (
     ),
     ("alg", "act", "act"),
     ("alg", "process_env_step", "record"),
-    ("alg.imitation", "record", "imitation scoring"),
+    ("alg.imitation", "rewards", "imitation scoring"),
     ("alg.imitation.selector", "record", "premium windows"),
     ("alg.reference", "record", "residual reward"),
     ("alg", "compute_returns", "returns"),
