@@ -12,6 +12,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import TextIO
 
+import matplotlib
 import torch
 from rich.console import Console
 from rich.table import Table
@@ -33,6 +34,7 @@ from kiras_rl.tools.benchmarks import (
     terrain,
 )
 from kiras_rl.tools.benchmarks.request import Figures, Request
+from kiras_rl.tools.benchmarks.tables import STYLE
 from kiras_rl.tools.training import resolve_device
 
 DESCRIPTION = """\
@@ -188,7 +190,8 @@ def bench(args: argparse.Namespace) -> None:
         if args.out:
             _save(args.out, report, tables)
         if args.plot and hasattr(PARTS[name], "plot"):
-            PARTS[name].plot(report[name], args.out / f"{name}.png")
+            with matplotlib.rc_context(STYLE):
+                PARTS[name].plot(report[name], args.out / f"{name}.png")
 
 
 def _config(args: argparse.Namespace) -> Config:

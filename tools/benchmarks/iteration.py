@@ -12,7 +12,7 @@ from rich.table import Table
 
 from kiras_rl.phases import phases_of
 from kiras_rl.tools.benchmarks.request import Figures, Request
-from kiras_rl.tools.benchmarks.tables import make_table, save_figure
+from kiras_rl.tools.benchmarks.tables import make_table
 from kiras_rl.tools.benchmarks.training import Training
 from kiras_rl.tools.benchmarks.workload import ENVIRONMENT_PARTS
 from kiras_rl.tools.timing import PartTimer, Times
@@ -101,8 +101,9 @@ def plot(figures: Figures, path: Path) -> None:
     figure = Figure(figsize=(11, 1.9 + 0.8 * len(phases)), layout="constrained")
     axes = figure.subplots()
     colors = dict(zip(_parts_of(figures), colormaps["tab20"].colors, strict=False))
+    longest = max(sum(seconds.values()) for seconds in phases.values())
     for row, seconds in enumerate(phases.values()):
-        _stack(axes, row, seconds, colors)
+        _stack(axes, row, seconds, colors, least=0.04 * longest)
     axes.set_yticks(range(len(phases)), [_words(phase) for phase in phases])
     axes.invert_yaxis()
     axes.set_xlabel(
@@ -111,15 +112,18 @@ def plot(figures: Figures, path: Path) -> None:
     )
     handles, labels = axes.get_legend_handles_labels()
     legend = dict(zip(labels, handles, strict=True))
-    figure.legend(legend.values(), legend, loc="outside lower center", ncols=6, frameon=False)
-    save_figure(figure, path)
+    figure.legend(legend.values(), legend, loc="outside lower center", ncols=5, frameon=False)
+    figure.savefig(path)
 
 
-def _stack(axes: Axes, row: int, seconds: dict[str, float], colors: dict[str, tuple]) -> None:
+def _stack(
+    axes: Axes, row: int, seconds: dict[str, float], colors: dict[str, tuple], least: float
+) -> None:
+    """Draw a bar; parts of less than `least` seconds have no room for a number."""
     left, whole = 0.0, sum(seconds.values())
     for part, width in seconds.items():
         axes.barh(row, width, left=left, color=colors[part], label=part, height=0.6)
-        if width > 0.04 * whole:  # less has no room for a number
+        if width > least:
             text = f"{100 * width / whole:.0f} %"
             axes.text(left + width / 2, row, text, ha="center", va="center")
         left += width

@@ -28,7 +28,7 @@ from kiras_rl.process import single_threaded
 from kiras_rl.robots.robot import Robot, load_robot
 from kiras_rl.schema import Config
 from kiras_rl.tools.benchmarks.request import Figures, Request
-from kiras_rl.tools.benchmarks.tables import make_table, save_figure
+from kiras_rl.tools.benchmarks.tables import make_table
 from kiras_rl.tools.benchmarks.workload import Workload
 
 FIRST = 256
@@ -212,17 +212,20 @@ def plot(figures: Figures, path: Path) -> None:
     figure = Figure(figsize=(9, 3.6), layout="constrained")
     speed, memory = figure.subplots(1, 2)
     worlds = [size["worlds"] for size in figures["sizes"]]
-    speed.plot(worlds, [size["steps_per_second"] for size in figures["sizes"]], marker="o")
-    speed.set_ylabel("environment steps / s")
-    memory.plot(worlds, [size["memory_bytes"] / 1e6 for size in figures["sizes"]], marker="o")
-    memory.set_ylabel("memory (MB)")
-    for axes in (speed, memory):
+    rates = [size["steps_per_second"] for size in figures["sizes"]]
+    megabytes = [size["memory_bytes"] / 1e6 for size in figures["sizes"]]
+    for axes, values, label in (
+        (speed, rates, "environment steps / s"),
+        (memory, megabytes, "memory (MB)"),
+    ):
+        axes.plot(worlds, values, marker="o")
+        axes.set_ylim(0.0, 1.1 * max(values))
+        axes.set_ylabel(label)
         axes.set_xscale("log", base=2)
         axes.set_xticks(worlds)
         axes.xaxis.set_major_formatter(ScalarFormatter())
         axes.xaxis.set_minor_formatter(NullFormatter())
-        axes.set_ylim(bottom=0)
         axes.set_xlabel("worlds")
         axes.grid(alpha=0.3)
     figure.suptitle(f"{figures['robot']}, {figures['backend']} on {figures['device']}")
-    save_figure(figure, path)
+    figure.savefig(path)

@@ -1,14 +1,11 @@
-"""Tables and pictures that all parts of a benchmark share."""
+"""How all parts of a benchmark show their figures."""
 
 from __future__ import annotations
 
-from pathlib import Path
-
-import matplotlib
-from matplotlib.figure import Figure
 from rich.table import Table
 
-_STYLE = {"font.size": 9, "axes.spines.top": False, "axes.spines.right": False}
+STYLE = {"font.size": 9, "axes.spines.top": False, "axes.spines.right": False, "savefig.dpi": 130}
+"""Settings of matplotlib for the pictures."""
 
 
 def make_table(title: str, *columns: str) -> Table:
@@ -28,9 +25,3 @@ def with_range(summary: dict[str, float]) -> tuple[str, str]:
 def verdict(is_met: bool, target: str) -> str:
     """Return a line under a table: whether its target is met."""
     return f"[green]{target}: met[/]" if is_met else f"[red]{target}: missed[/]"
-
-
-def save_figure(figure: Figure, path: Path) -> None:
-    """Write a picture."""
-    with matplotlib.rc_context(_STYLE):
-        figure.savefig(path, dpi=130)
