@@ -6,11 +6,12 @@ import os
 import pickle
 import platform
 import zipfile
+from collections.abc import Callable
 from pathlib import Path
 
 import torch
 
-from kiras_rl import __version__
+from kiras_rl import __version__, distributed
 from kiras_rl.models.exported import ExportedPolicy, build_policy
 
 FORMAT = 2
@@ -78,6 +79,48 @@ def load_checkpoint(path: Path) -> dict:
             f"{path} has checkpoint format {content['format']}, this version reads {FORMAT}"
         )
     return content
+
+
+def save_ranks(path: Path, make_content: Callable[[], dict], state: dict) -> None:
+    """Let rank 0 write one checkpoint for all ranks.
+
+    Args:
+        path: Where to.
+        make_content: Return all that is the same on every rank, as `save_checkpoint` takes it.
+        state: What differs: `env`, `generators` and what the learner knows of this rank's worlds,
+            `learner`. Of rank 0 the last one is left out: the content's `learner` has it.
+    """
+    states = distributed.gather_states(state)
+
+    def write() -> None:
+        own = {name: states[0][name] for name in ("env", "generators")}
+        save_checkpoint(path, make_content() | own | {"others": states[1:]})
+
+    distributed.from_main(write)
+
+
+def load_ranks(path: Path) -> tuple[dict, dict]:
+    """Let rank 0 read a checkpoint for all ranks.
+
+    Returns:
+        The content, with the number of `ranks` that wrote it, and what `save_ranks` took as the
+        state of this rank; nothing if another number of ranks wrote it.
+
+    Raises:
+        CheckpointError: As `load_checkpoint`, on every rank.
+    """
+    others: list[dict] = []
+
+    def read() -> dict:
+        content = load_checkpoint(path)
+        others.extend(content.pop("others", []))
+        return content | {"ranks": 1 + len(others)}
+
+    content = distributed.from_main(read)
+    if content["ranks"] != distributed.size():
+        return content, {}
+    first = {"learner": {}} | {name: content[name] for name in ("env", "generators")}
+    return content, distributed.scatter_states([first, *others])
 
 
 def find_checkpoint(source: Path, prefer: str = BEST) -> Path:

@@ -46,3 +46,24 @@ def phase_config(config: Config, phase: str) -> Config:
 def total_iterations(config: Config) -> int:
     """Return the iterations of all phases, T1 + T2."""
     return config.iterations + (config.finetuning.iterations if config.finetuning else 0)
+
+
+def rsl_rl_config(config: Config, phase: str, step_dt: float) -> dict:
+    """Return the dictionary with which rsl-rl's runner builds the learner of a phase.
+
+    Args:
+        config: The run, all its phases.
+        phase: Which one.
+        step_dt: Duration of a control step, s.
+    """
+    alone = phase_config(config, phase)
+    finetuning = config.finetuning if phase == FINETUNING else None
+    return {
+        "algorithm": {"class_name": "kiras_rl.algorithms.kiras.KirasPPO"},
+        "learner": alone.learner,
+        "iterations": alone.iterations,
+        "retention": finetuning.retention if finetuning else None,
+        "reward_scale": step_dt if config.env.rewards.scale_by_dt else 1.0,
+        "num_steps_per_env": alone.learner.ppo.num_steps,
+        "save_interval": 0,
+    }

@@ -7,6 +7,8 @@ from contextlib import suppress
 
 import torch
 
+from kiras_rl import distributed
+
 
 class StopRequest:
     """Turns SIGINT and SIGTERM into a flag while the context is open."""
@@ -22,7 +24,13 @@ class StopRequest:
 
     def _request(self, number: int, frame: object) -> None:
         self.requested = True
-        signal.signal(number, self._old[number])  # a second one acts at once
+        if distributed.size() == 1:  # torchrun passes Ctrl-C on, which the terminal gave all before
+            signal.signal(number, self._old[number])  # a second one acts at once
+
+    def agree(self) -> bool:
+        """Return whether any rank was asked; from then on, all were."""
+        self.requested = distributed.any_rank(self.requested)
+        return self.requested
 
     def __exit__(self, *_: object) -> None:
         """Restore the handlers."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Callable
 from contextlib import nullcontext
@@ -14,50 +15,31 @@ from rsl_rl.utils import check_nan
 from tensordict import TensorDict
 from torch.utils.tensorboard import SummaryWriter
 
-from kiras_rl import __version__, checkpoint
+from kiras_rl import __version__, checkpoint, distributed
 from kiras_rl.algorithms.kiras import KirasPPO
 from kiras_rl.config import config_to_dict
 from kiras_rl.deploy.metadata import FORMAT as METADATA_FORMAT
 from kiras_rl.evaluation.flat import Policy, SkillResult, as_scalars, score
 from kiras_rl.evaluation.terrain import TerrainResult
 from kiras_rl.interfaces import SkillEnv
-from kiras_rl.phases import FINETUNING, SKILL_LEARNING, phase_config, total_iterations
-from kiras_rl.process import (
-    StopRequest,
-    generator_states,
-    set_generator_states,
-    single_threaded,
-)
+from kiras_rl.phases import SKILL_LEARNING, rsl_rl_config, total_iterations
+from kiras_rl.process import StopRequest, generator_states, set_generator_states, single_threaded
 from kiras_rl.schema import Config
+from kiras_rl.status import Status
+
+COUNTS = ("Episode/", "Sim/")
+"""Tags of numbers that are added up, over the steps of a rollout and over the ranks."""
+
+ANEW = (
+    "%s is of a run with %d rank(s), this one has %d: networks, optimizers, premium buffer and "
+    "statistics go on, all worlds begin anew"
+)
+
+_log = logging.getLogger(__name__)
 
 
 class TrainingError(ValueError):
     """A training that cannot go on: says where it broke and what is left."""
-
-
-@dataclass
-class Status:
-    """What a progress line shows after an iteration.
-
-    Attributes:
-        phase: Name of the phase, see kiras_rl.phases.
-        iteration: Iterations done, over all phases.
-        iterations: Iterations in all.
-        steps: Environment steps done, over all phases.
-        seconds: Wall time of this iteration.
-        scalars: Everything that was logged for it.
-        evaluation: The latest deterministic evaluation on flat ground, empty before the first.
-        terrain: The latest one on terrain, None where there is none.
-    """
-
-    phase: str
-    iteration: int
-    iterations: int
-    steps: int
-    seconds: float
-    scalars: dict[str, float]
-    evaluation: dict[str, SkillResult]
-    terrain: TerrainResult | None
 
 
 @dataclass(frozen=True)
@@ -103,10 +85,11 @@ class KirasRunner(OnPolicyRunner):
             commit: Of the source, for the provenance of the policy.
             phase: Which phase to train.
         """
-        torch.manual_seed(config.seed)
+        torch.manual_seed(config.seed + distributed.rank())
         self.config, self.run_dir, self.phase = config, run_dir, phase
-        settings = _rsl_rl_config(config, phase, env.step_dt)
+        settings = rsl_rl_config(config, phase, env.step_dt)
         super().__init__(env, settings, log_dir=None, device=device)
+        self.alg.broadcast_parameters()
         self._first = 0 if phase == SKILL_LEARNING else config.iterations
         self._last = self._first + settings["iterations"]
         self.current_learning_iteration = self._first
@@ -120,6 +103,12 @@ class KirasRunner(OnPolicyRunner):
         self._writer: SummaryWriter | None = None
         self._last_saved = time.monotonic()
 
+    def _configure_multi_gpu(self) -> None:
+        """Leave the ranks to kiras_rl.distributed: rsl-rl's own set-up knows NCCL alone."""
+        self.gpu_local_rank, self.gpu_global_rank = distributed.local_rank(), distributed.rank()
+        self.gpu_world_size = distributed.size()
+        self.is_distributed = self.gpu_world_size > 1
+
     # --- the loop -------------------------------------------------------------------------------
 
     def learn(
@@ -131,7 +120,7 @@ class KirasRunner(OnPolicyRunner):
     ) -> bool:
         """Train until the phase is done or the process is asked to stop.
 
-        SIGINT and SIGTERM let the iteration end, save, and return.
+        SIGINT and SIGTERM, on any rank, let the iteration end, save, and return.
 
         Args:
             num_learning_iterations: At most this many now; None for all that remain.
@@ -149,11 +138,12 @@ class KirasRunner(OnPolicyRunner):
             last = min(last, self.current_learning_iteration + num_learning_iterations)
         self._open_log()
         with nullcontext(stop) if stop else StopRequest() as request:
-            while self.current_learning_iteration < last and not request.requested:
+            while self.current_learning_iteration < last and not request.agree():
                 status = self._iterate()
                 if on_iteration:
                     on_iteration(status)
-                if time.monotonic() - self._last_saved > 60.0 * self.config.checkpoint_minutes:
+                age = time.monotonic() - self._last_saved
+                if distributed.any_rank(age > 60.0 * self.config.checkpoint_minutes):
                     self.save_latest()
             finished = self.current_learning_iteration >= self._last
             if finished and self.best_networks is None:  # nothing was evaluated
@@ -170,7 +160,7 @@ class KirasRunner(OnPolicyRunner):
         self._renew_skill_probabilities(scalars)
         learned = time.perf_counter()
         self.current_learning_iteration += 1
-        steps = self.env.num_envs * self.cfg["num_steps_per_env"]
+        steps = self.env.num_envs * self.cfg["num_steps_per_env"] * distributed.size()
         self.steps += steps
         physics = log.pop("Perf/physics_time")
         scalars |= {key: value.item() for key, value in log.items()} | {
@@ -180,6 +170,7 @@ class KirasRunner(OnPolicyRunner):
             "Perf/learning_time": learned - collected,
             "Perf/steps_per_second": steps / (learned - begin),
         }
+        scalars = distributed.mean_scalars(scalars, summed=COUNTS)
         scalars |= self._evaluate_when_due()
         seconds = time.perf_counter() - begin
         self.seconds += seconds
@@ -216,18 +207,23 @@ class KirasRunner(OnPolicyRunner):
         self._check_finite(obs)
         with torch.no_grad():
             self.alg.compute_returns(obs)
-        counts = ("Episode/", "Sim/", "Perf/")
-        return {k: v if k.startswith(counts) else v / num_steps for k, v in totals.items()}
+        sums = (*COUNTS, "Perf/")
+        return {k: v if k.startswith(sums) else v / num_steps for k, v in totals.items()}
 
     def _check_finite(self, obs: TensorDict) -> None:
+        fault = ""
         try:
             check_nan(obs, self.alg.storage.task_rewards, self.alg.storage.dones)
         except ValueError as error:
+            fault = str(error)
+        if distributed.any_rank(bool(fault)):
             raise TrainingError(
-                f"iteration {self.current_learning_iteration + 1}: {error} Worlds that diverge are "
-                "reset before this, so look at your own terms or lower learner.ppo.learning_rate; "
+                f"iteration {self.current_learning_iteration + 1}: "
+                f"{fault or 'Another rank met values that are not finite.'} Worlds that diverge "
+                "are reset before this, so look at your own terms or lower "
+                "learner.ppo.learning_rate; "
                 f"the last checkpoint stays as it is ({self.run_dir})"
-            ) from None
+            )
 
     def _renew_skill_probabilities(self, scalars: dict[str, float]) -> None:
         probabilities = self.alg.skill_probabilities(self.env.keyframe_observations())
@@ -242,15 +238,18 @@ class KirasRunner(OnPolicyRunner):
         if not self.evaluators.flat or not interval or (done % interval and done != self._last):
             return {}
         begin = time.perf_counter()
-        with single_threaded(self.device):
-            self.evaluation = self.evaluators.flat(self.alg.act_deterministic)
-            if self.evaluators.terrain:
-                self.terrain = self.evaluators.terrain(self.alg.act_deterministic)
+        self.evaluation, self.terrain = distributed.from_main(self._evaluate)
         scalars = as_scalars(self.evaluation)
         if self.terrain:
             scalars |= self.terrain.as_scalars()
         self._keep_best()
         return scalars | {"Perf/evaluation_time": time.perf_counter() - begin}
+
+    def _evaluate(self) -> tuple[dict[str, SkillResult], TerrainResult | None]:
+        flat, terrain = self.evaluators.flat, self.evaluators.terrain
+        policy = self.alg.act_deterministic
+        with single_threaded(self.device):
+            return flat(policy) if flat else {}, terrain(policy) if terrain else None
 
     def _keep_best(self) -> None:
         current = score(self.evaluation)
@@ -264,7 +263,7 @@ class KirasRunner(OnPolicyRunner):
     # --- log ------------------------------------------------------------------------------------
 
     def _open_log(self) -> None:
-        if self.run_dir is not None:
+        if self.run_dir is not None and distributed.is_main():
             # purge_step: after a resume, points that a lost stretch had written disappear
             self._writer = SummaryWriter(
                 str(self.run_dir), purge_step=self.current_learning_iteration + 1, flush_secs=10
@@ -292,9 +291,23 @@ class KirasRunner(OnPolicyRunner):
             self.save(str(self.run_dir / checkpoint.FOLDER / name))
 
     def save(self, path: str, infos: dict | None = None) -> None:
-        """Write everything that training depends on to `path`."""
+        """Let rank 0 write everything that training depends on to `path`."""
+        checkpoint.save_ranks(
+            Path(path), lambda: self._content() | {"infos": infos}, self._rank_state()
+        )
+
+    def _rank_state(self) -> dict:
+        """Return what differs between the ranks."""
+        return {
+            "learner": self.alg.world_state(),
+            "env": self.env.state_dict(),
+            "generators": generator_states(),
+        }
+
+    def _content(self) -> dict:
+        """Return what does not."""
         policy = self.alg.policy()
-        content = {
+        return {
             "config": config_to_dict(self.config),
             "phase": self.phase,
             "skills": list(self.env.skills),
@@ -303,14 +316,10 @@ class KirasRunner(OnPolicyRunner):
             "best_score": self.best_score,
             "best_networks": self.best_networks,
             "learner": self.alg.save(),
-            "env": self.env.state_dict(),
-            "generators": generator_states(),
             "policy": policy.state_dict(),
             "policy_shape": policy.shape(),
             "description": self.describe_policy(),
-            "infos": infos,
         }
-        checkpoint.save_checkpoint(Path(path), content)
 
     def describe_policy(self) -> dict:
         """Return the policy's metadata with where it comes from."""
@@ -333,24 +342,34 @@ class KirasRunner(OnPolicyRunner):
         strict: bool = True,
         map_location: str | None = None,
     ) -> dict | None:
-        """Go on exactly from a checkpoint.
+        """Go on from a checkpoint: exactly, with as many ranks as wrote it.
+
+        With another number of ranks, worlds begin anew.
 
         Raises:
             CheckpointError: Unusable file, or one of other skills.
         """
-        content = self._read(path)
+        fresh = self.alg.world_state()
+        content, own = self._read(path)
         if content["phase"] != self.phase:
             raise checkpoint.CheckpointError(
                 f"{path} is of the phase {content['phase']}, not of {self.phase}"
             )
         self.alg.load(content["learner"], load_cfg, strict)
-        self.env.load_state_dict(content["env"])
         self.current_learning_iteration = content["iteration"]
         self.seconds, self.best_score = content["seconds"], content["best_score"]
         self.best_networks = content["best_networks"]
         provenance = content["description"]["provenance"]
         self.steps, self.begun_from = provenance["steps"], provenance.get("begun_from")
-        set_generator_states(content["generators"])
+        if own:
+            self.alg.load_world_state(own["learner"])
+            self.env.load_state_dict(own["env"])
+            set_generator_states(own["generators"])
+        else:
+            self.alg.load_world_state(fresh)
+            self._tell_skill_probabilities()
+            if distributed.is_main():
+                _log.warning(ANEW, path, content["ranks"], distributed.size())
         return content["infos"]
 
     def begin_from(self, path: Path) -> None:
@@ -361,32 +380,21 @@ class KirasRunner(OnPolicyRunner):
         Raises:
             CheckpointError: Unusable file, or one of other skills.
         """
-        content = self._read(path)
+        content, _ = self._read(path)
         self.alg.begin_from(content["best_networks"], content["learner"])
         self.seconds = content["seconds"]
         self.steps = content["description"]["provenance"]["steps"]
+        self._tell_skill_probabilities()
+
+    def _tell_skill_probabilities(self) -> None:
         if self.alg.sampler:
             self.env.set_skill_probabilities(self.alg.sampler.probabilities)
 
-    def _read(self, path: str | Path) -> dict:
-        content = checkpoint.load_checkpoint(Path(path))
+    def _read(self, path: str | Path) -> tuple[dict, dict]:
+        content, own = checkpoint.load_ranks(Path(path))
         if content["skills"] != list(self.env.skills):
             raise checkpoint.CheckpointError(
                 f"{path} was trained on the skills {', '.join(content['skills'])}; the robot has "
                 f"{', '.join(self.env.skills)}: mend its keyframes.yaml or start a new run"
             )
-        return content
-
-
-def _rsl_rl_config(config: Config, phase: str, step_dt: float) -> dict:
-    alone = phase_config(config, phase)
-    finetuning = config.finetuning if phase == FINETUNING else None
-    return {
-        "algorithm": {"class_name": "kiras_rl.algorithms.kiras.KirasPPO"},
-        "learner": alone.learner,
-        "iterations": alone.iterations,
-        "retention": finetuning.retention if finetuning else None,
-        "reward_scale": step_dt if config.env.rewards.scale_by_dt else 1.0,
-        "num_steps_per_env": alone.learner.ppo.num_steps,
-        "save_interval": 0,
-    }
+        return content, own

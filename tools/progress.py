@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.live import Live
 from rich.text import Text
 
-from kiras_rl.runner import Status
+from kiras_rl.status import Status
 
 PLAIN_INTERVAL = 30.0  # s between lines where the output is not a terminal
 WINDOW = 40  # iterations over which the pace is averaged

@@ -10,6 +10,7 @@ import shutil
 import sys
 from pathlib import Path
 
+from kiras_rl import distributed
 from kiras_rl.checkpoint import FLAT, FOLDER, LATEST, find_checkpoint
 from kiras_rl.config import ConfigError, list_configs, load_config
 from kiras_rl.process import StopRequest
@@ -41,6 +42,7 @@ examples:
   kiras-train --cfg solo8 --flat runs/solo8/2026-01-31_12-00-00   its skills, finetuned anew
   kiras-train --sweep ablations                       KiRAS and its ablations, two seeds each
   kiras-train --sweep mine.yaml num_envs=512          your own sweep, a key set in all its runs
+  torchrun --nproc-per-node 4 -m kiras_rl.tools.train --cfg solo8   on four GPUs
   tensorboard --logdir runs
 """
 
@@ -49,12 +51,19 @@ def main(argv: list[str] | None = None) -> int:
     """Run the command; return its exit code."""
     args = _parse(argv)
     logging.basicConfig(format="%(message)s")
-    logging.getLogger("kiras_rl").setLevel(logging.INFO)  # "kernels compile": minutes, once
     try:
-        return _train_sweep(args) if args.sweep else _train_one(args)
+        with distributed.group():
+            return _train(args)
     except MISTAKES as error:
-        print(f"error: {error}", file=sys.stderr)
+        if distributed.local_rank() == 0:  # the others of a machine make the same
+            print(f"error: {error}", file=sys.stderr)
         return 2
+    except distributed.RankLostError as error:
+        print(
+            f"error: {error}; the last checkpoint stays as it is: go on with --resume",
+            file=sys.stderr,
+        )
+        return 1
 
 
 def _parse(argv: list[str] | None) -> argparse.Namespace:
@@ -79,29 +88,51 @@ def _parse(argv: list[str] | None) -> argparse.Namespace:
     return parser.parse_intermixed_args(argv)
 
 
+def _train(args: argparse.Namespace) -> int:
+    console.quiet = not distributed.is_main()
+    if distributed.is_main():
+        logging.getLogger("kiras_rl").setLevel(logging.INFO)  # "kernels compile": minutes, once
+    return _train_sweep(args) if args.sweep else _train_one(args)
+
+
 def _train_one(args: argparse.Namespace) -> int:
     if args.resume is None:
         runner = _new_run(args)
     elif args.flat is None:
-        runner = resume(find_checkpoint(args.resume, prefer=LATEST), args.overrides)
+        runner = resume(_find(args.resume, LATEST), args.overrides)
     else:
         raise ConfigError("--flat begins a new run: give it with --cfg, not with --resume")
     with StopRequest() as stop:
         finished = train_run(runner, stop)
     if not finished:
-        _say(f"stopped and saved; go on with: kiras-train --resume {runner.run_dir}")
+        _say(f"stopped and saved; go on with: {_command()} --resume {runner.run_dir}")
     return 0
+
+
+def _command() -> str:
+    if distributed.size() == 1:
+        return "kiras-train"
+    return f"torchrun --nproc-per-node {distributed.local_size()} -m kiras_rl.tools.train"
 
 
 def _new_run(args: argparse.Namespace) -> KirasRunner:
     config = load_config(args.cfg, args.overrides)
-    flat = find_checkpoint(args.flat, prefer=FLAT) if args.flat else None
+    flat = _find(args.flat, FLAT) if args.flat else None
     runner = begin(config, flat)
-    runner.run_dir = claim(_new_run_dir(args.runs, args.cfg))
-    if flat:
-        (runner.run_dir / FOLDER).mkdir()
-        shutil.copyfile(flat, runner.run_dir / FOLDER / FLAT)
+    runner.run_dir = distributed.from_main(lambda: _make_folder(args, flat))
     return runner
+
+
+def _find(source: Path, prefer: str) -> Path:
+    return distributed.from_main(lambda: find_checkpoint(source, prefer))
+
+
+def _make_folder(args: argparse.Namespace, flat: Path | None) -> Path:
+    run_dir = claim(_new_run_dir(args.runs, args.cfg))
+    if flat:
+        (run_dir / FOLDER).mkdir()
+        shutil.copyfile(flat, run_dir / FOLDER / FLAT)
+    return run_dir
 
 
 def _new_run_dir(runs: Path, cfg: str) -> Path:
@@ -125,6 +156,8 @@ def claim(folder: Path) -> Path:
 def _train_sweep(args: argparse.Namespace) -> int:
     if args.flat is not None:
         raise ConfigError("--flat begins a new run: give it with --cfg, not with --sweep")
+    if distributed.size() > 1:
+        raise ConfigError("--sweep trains on one process: start it without torchrun")
     report = train_sweep(load_sweep(args.sweep, args.overrides, args.runs))
     console.print(report.table())
     if report.stopped:

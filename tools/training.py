@@ -10,7 +10,7 @@ from pathlib import Path
 import torch
 from rich.console import Console
 
-from kiras_rl import checkpoint
+from kiras_rl import checkpoint, distributed
 from kiras_rl.checkpoint import CheckpointError
 from kiras_rl.config import ConfigError, check_resume_overrides, config_from_dict, save_config
 from kiras_rl.deploy.policy import OnboardPolicy, PolicyError, PolicyMetadata
@@ -57,7 +57,7 @@ def begin(config: Config, flat: Path | None = None) -> KirasRunner:
         CheckpointError: A checkpoint that does not fit.
         ConfigError: What this phase or a later one could not use.
     """
-    content = read_flat(flat, config) if flat else None
+    content = distributed.from_main(lambda: read_flat(flat, config)) if flat else None
     check(config)
     runner = build(config, None, FINETUNING if flat else SKILL_LEARNING)
     if flat and content:
@@ -79,12 +79,17 @@ def resume(source: Path, overrides: list[str]) -> KirasRunner:
         ConfigError: A key that may not change.
     """
     check_resume_overrides(overrides)
-    run_dir, saved = _run_of(source), checkpoint.load_checkpoint(source)
-    config = config_from_dict(saved["config"], overrides)
+    run_dir, (values, phase) = _run_of(source), distributed.from_main(lambda: _read_run(source))
+    config = config_from_dict(values, overrides)
     check(config)
-    runner = build(config, run_dir, saved["phase"])
+    runner = build(config, run_dir, phase)
     runner.load(str(source))
     return runner
+
+
+def _read_run(source: Path) -> tuple[dict, str]:
+    saved = checkpoint.load_checkpoint(source)
+    return saved["config"], saved["phase"]
 
 
 def check(config: Config) -> None:
@@ -121,7 +126,10 @@ def build(
         PolicyError: A policy that could not be exported.
     """
     device = resolve_device(config.device)
-    env = make_env(phase_config(config, phase), device, num_envs)
+    alone = phase_config(config, phase)
+    alone.seed += distributed.rank()  # every rank has worlds of its own, and its share of the cores
+    alone.sim.threads = alone.sim.threads or distributed.core_share()
+    env = make_env(alone, device, num_envs)
     evaluators = make_evaluators(config, phase, device)
     runner = KirasRunner(env, config, run_dir, device, evaluators, _source_commit(), phase)
     # What could not be exported is refused now, not after hours of training.
@@ -130,18 +138,31 @@ def build(
 
 
 def resolve_device(name: str) -> str:
-    """Return "cpu" or a CUDA device.
+    """Return "cpu" or a CUDA device; of several ranks each has its own.
 
     Raises:
-        ConfigError: CUDA asked for where there is none, or an unknown name.
+        ConfigError: CUDA asked for where there is none, or too little for the ranks, or an
+            unknown name.
     """
     if name == "auto":
-        return "cuda" if torch.cuda.is_available() else "cpu"
+        name = "cuda" if torch.cuda.is_available() else "cpu"
     if name.split(":")[0] not in ("cpu", "cuda"):
         raise ConfigError(f"device={name}: allowed are auto, cpu, cuda")
     if name.startswith("cuda") and not torch.cuda.is_available():
         raise ConfigError(f"device={name}: torch finds no CUDA device here; set device=cpu")
-    return name
+    return name if name == "cpu" or distributed.size() == 1 else _device_of_rank(name)
+
+
+def _device_of_rank(name: str) -> str:
+    if name != "cuda":
+        raise ConfigError(f"device={name}: each rank takes a GPU of its own; set device=cuda")
+    ranks, devices = distributed.local_size(), torch.cuda.device_count()
+    if ranks > devices:
+        raise ConfigError(
+            f"{ranks} ranks on a machine with {devices} CUDA device(s): start at most as many with "
+            "torchrun --nproc-per-node, or set device=cpu"
+        )
+    return f"cuda:{distributed.local_rank()}"
 
 
 def _source_commit() -> str:
@@ -168,8 +189,7 @@ def train_run(runner: KirasRunner, stop: StopRequest) -> bool:
         Whether the run came to its end.
     """
     assert runner.run_dir is not None
-    runner.run_dir.mkdir(parents=True, exist_ok=True)
-    save_config(runner.config, runner.run_dir / CONFIG)
+    distributed.from_main(lambda: _begin_folder(runner))
     _announce(runner)
     with Progress(console) as progress:
         finished = runner.learn(on_iteration=progress.show, stop=stop)
@@ -177,8 +197,14 @@ def train_run(runner: KirasRunner, stop: StopRequest) -> bool:
             runner = _next_phase(runner)
             finished = runner.learn(on_iteration=progress.show, stop=stop)
     if finished:
-        _conclude(runner)
+        distributed.from_main(lambda: _conclude(runner))
     return finished
+
+
+def _begin_folder(runner: KirasRunner) -> None:
+    assert runner.run_dir is not None
+    runner.run_dir.mkdir(parents=True, exist_ok=True)
+    save_config(runner.config, runner.run_dir / CONFIG)
 
 
 def is_finished(run_dir: Path, iterations: int) -> bool:
@@ -206,9 +232,13 @@ def _next_phase(before: KirasRunner) -> KirasRunner:
     folder = before.run_dir / checkpoint.FOLDER
     runner = build(before.config, before.run_dir, FINETUNING)
     runner.begin_from(folder / checkpoint.LATEST)
+    distributed.from_main(lambda: _keep_flat(folder))
+    return runner
+
+
+def _keep_flat(folder: Path) -> None:
     with suppress(FileNotFoundError):
         (folder / checkpoint.BEST).replace(folder / checkpoint.FLAT)
-    return runner
 
 
 def _announce(runner: KirasRunner) -> None:
@@ -216,10 +246,12 @@ def _announce(runner: KirasRunner) -> None:
     backend = resolve_backend(config.sim.backend, torch.device(runner.device))
     phases = (FINETUNING,) if runner.begun_from else phases_of(config)
     lengths = [phase_config(config, phase).iterations for phase in phases]
-    steps = config.num_envs * config.learner.ppo.num_steps * sum(lengths)
+    ranks = distributed.size()
+    steps = ranks * config.num_envs * config.learner.ppo.num_steps * sum(lengths)
+    worlds = f"{config.num_envs} worlds" if ranks == 1 else f"{ranks} x {config.num_envs} worlds"
     console.print(
         f"[bold]{config.robot}[/]: {_what_begins(runner)}, {', '.join(runner.env.skills)} | "
-        f"{config.num_envs} worlds, {backend} physics, {runner.device} | "
+        f"{worlds}, {backend} physics, {runner.device} | "
         f"{' + '.join(map(str, lengths))} iterations, {steps / 1e6:.1f} M steps | "
         f"{runner.run_dir}",
         highlight=False,

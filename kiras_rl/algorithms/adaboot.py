@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import torch
 
+from kiras_rl import distributed
+
 MODES = ("gate_update", "bootstrap_input", "both", "off")
 _MIN_WORLDS = 64  # with completed episodes, before their spread means anything
 
@@ -45,9 +47,10 @@ class AdaBoot:
 
     def renew(self) -> None:
         """Once an iteration: renew p, and which worlds' actors see the estimate."""
-        known = self._last[~self._last.isnan()]
+        last = distributed.gather(self._last)
+        known = last[~last.isnan()]
         # one world alone has no spread
-        self._ready = len(known) >= max(2, min(_MIN_WORLDS, len(self._last)))
+        self._ready = len(known) >= max(2, min(_MIN_WORLDS, len(last)))
         if self._ready:
             self.probability = trust(known)
         if self.bootstraps_input:
@@ -55,19 +58,24 @@ class AdaBoot:
             self.uses_estimate = draws < self.probability
 
     def update_allowed(self) -> bool:
-        """Draw whether the estimator may be trained in this iteration."""
+        """Draw whether the estimator may be trained in this iteration, on all ranks or on none."""
         if not self.gates_update or not self._ready:
             return True
-        return bool(torch.rand(()) < self.probability.clamp(min=self._floor).cpu())
+        draw = distributed.broadcast(torch.rand(()))
+        return bool(draw < self.probability.clamp(min=self._floor).cpu())
 
     def state_dict(self) -> dict:
         """Return the statistics."""
-        names = ("_running", "_length", "_last", "probability", "uses_estimate")
-        return {name: getattr(self, name) for name in names} | {"ready": self._ready}
+        return self.world_state() | {"probability": self.probability, "ready": self._ready}
+
+    def world_state(self) -> dict:
+        """Return what belongs to the worlds of this rank."""
+        names = ("_running", "_length", "_last", "uses_estimate")
+        return {name: getattr(self, name) for name in names}
 
     def load_state_dict(self, state: dict) -> None:
-        """Go on from saved statistics."""
+        """Go on from saved statistics, or from those of the worlds alone."""
         state = dict(state)
-        self._ready = state.pop("ready")
+        self._ready = state.pop("ready", self._ready)
         for name, value in state.items():
             setattr(self, name, value.to(self._running.device))

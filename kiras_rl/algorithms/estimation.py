@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from tensordict import TensorDict
 
+from kiras_rl import distributed
 from kiras_rl import interfaces as names
 from kiras_rl.algorithms.adaboot import MODES, AdaBoot
 from kiras_rl.algorithms.losses import gaussian_kl, masked_mse
@@ -107,6 +108,7 @@ class Estimation:
             loss = loss + self.config.kl_weight * kl + self.config.prior_weight * prior
             self.optimizer.zero_grad()
             loss.backward()
+            distributed.average_gradients(self.estimator.parameters())
             self.optimizer.step()
             totals += torch.stack(parts).detach()
         means = (totals / (num_mini_batches * self.config.epochs)).tolist()

@@ -11,12 +11,15 @@ from rsl_rl.models import MLPModel
 from tensordict import TensorDict
 from torch import nn
 
+from kiras_rl import distributed
 from kiras_rl import interfaces as names
 from kiras_rl.algorithms import losses, returns
+from kiras_rl.algorithms.adaboot import AdaBoot
 from kiras_rl.algorithms.estimation import Estimation
 from kiras_rl.algorithms.parts import Parts, build_parts
 from kiras_rl.algorithms.residual import Reference
 from kiras_rl.algorithms.storage import GroupRolloutStorage, mini_batches
+from kiras_rl.imitation.premium import PremiumSelector
 from kiras_rl.imitation.self_imitation import SelfImitation
 from kiras_rl.interfaces import SkillEnv
 from kiras_rl.models.critics import GroupCritic
@@ -225,6 +228,7 @@ class KirasPPO(PPO):
             )
         self.optimizer.zero_grad()
         loss.backward()
+        distributed.average_gradients(chain(self.actor.parameters(), self.critic.parameters()))
         for network in (self.actor, *self.critic.critics):
             nn.utils.clip_grad_norm_(network.parameters(), self.max_grad_norm)
         self.optimizer.step()
@@ -234,7 +238,7 @@ class KirasPPO(PPO):
     def _adapt_to_kl(self, old_params: tuple[torch.Tensor, ...]) -> torch.Tensor:
         """Adapt the learning rate to the mean KL divergence from the rollout's policy."""
         distribution = self.actor.distribution
-        kl = distribution.kl_divergence(old_params, distribution.params).mean()
+        kl = distributed.mean(distribution.kl_divergence(old_params, distribution.params).mean())
         limits = self.config.ppo.learning_rate_range
         adapted = losses.adapt_learning_rate(self.learning_rate, kl, self.desired_kl, limits)
         self.learning_rate.copy_(adapted)  # in place: the optimizer reads this tensor
@@ -259,7 +263,7 @@ class KirasPPO(PPO):
         with torch.no_grad():
             values = self.critic({names.CRITIC: keyframe_observations.flatten(0, 1)})[:, TASK]
         values = values.unflatten(0, keyframe_observations.shape[:2]).mean(dim=1)
-        self.sampler.update(values, self._practised)
+        self.sampler.update(distributed.mean(values), distributed.total(self._practised))
         return self.sampler.probabilities
 
     def _describe_rollout(self) -> dict[str, float]:
@@ -349,6 +353,33 @@ class KirasPPO(PPO):
             self.sampler.probabilities = loaded_dict["skill_probabilities"].to(self.device)
         self._apply_schedules()
         return True
+
+    def world_state(self) -> dict:
+        """Return what of the statistics belongs to the worlds of this rank; `save` has it, too."""
+        return {name: part.world_state() for name, part in self._recorders().items()}
+
+    def load_world_state(self, state: dict) -> None:
+        """Load what `world_state` returned, or some of it."""
+        recorders = self._recorders()
+        for name, values in state.items():
+            recorders[name].load_state_dict(values)
+
+    def broadcast_parameters(self) -> None:
+        """Take the networks of rank 0."""
+        networks: list[nn.Module] = [self.actor, self.critic]
+        networks += [self.estimation.estimator] if self.estimation else []
+        networks += [self.imitation.discriminator] if self.imitation else []
+        networks += [self.reference.policy] if self.reference else []
+        for network in networks:
+            distributed.broadcast_module(network)
+
+    def _recorders(self) -> dict[str, AdaBoot | PremiumSelector]:
+        recorders: dict[str, AdaBoot | PremiumSelector] = {}
+        if self.estimation:
+            recorders["adaboot"] = self.estimation.adaboot
+        if self.imitation:
+            recorders["selector"] = self.imitation.selector
+        return recorders
 
     def _parts(self) -> dict[str, SelfImitation | Estimation | Reference]:
         parts = {

@@ -5,6 +5,8 @@ from __future__ import annotations
 import torch
 from torch import nn
 
+from kiras_rl import distributed
+
 
 def surrogate_loss(
     log_prob: torch.Tensor, old_log_prob: torch.Tensor, advantage: torch.Tensor, clip: float
@@ -36,7 +38,7 @@ def retention_loss(
     """
     weight = is_flat.float()
     squared = (mean - flat_action).square().sum(-1)
-    return (squared * weight).sum() / weight.sum().clamp(min=1.0)
+    return (squared * weight).sum() / _count(weight)
 
 
 def adapt_learning_rate(
@@ -66,7 +68,7 @@ def discriminator_loss(
         valid: Which of the policy's pairs count, (B,) bool.
     """
     weight = valid.float()
-    policy_part = ((policy + 1.0).square() * weight).sum() / weight.sum().clamp(min=1.0)
+    policy_part = ((policy + 1.0).square() * weight).sum() / _count(weight)
     return (expert - 1.0).square().mean() + policy_part
 
 
@@ -103,5 +105,14 @@ def gaussian_kl(
 def masked_mse(prediction: torch.Tensor, target: torch.Tensor, mask: torch.Tensor) -> torch.Tensor:
     """Return the mean squared error over the rows (N, k) that the mask (N,) keeps."""
     weight = mask.float().unsqueeze(-1)
-    count = (weight.sum() * prediction.shape[-1]).clamp(min=1.0)
+    count = _count(weight) * prediction.shape[-1]
     return ((prediction - target).square() * weight).sum() / count
+
+
+def _count(weight: torch.Tensor) -> torch.Tensor:
+    """Return the mean over the ranks of how many samples count; more than 0.
+
+    A sum over this rank's samples, divided by it, has gradients whose mean over the ranks is the
+    gradient of the mean over the samples of all: the ranks differ in how many of theirs count.
+    """
+    return distributed.total(weight.sum()).clamp(min=1.0) / distributed.size()

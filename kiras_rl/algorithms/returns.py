@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import torch
 
+from kiras_rl import distributed
+
 
 def generalized_advantages(
     rewards: torch.Tensor,
@@ -42,7 +44,7 @@ def generalized_advantages(
 def mix_advantages(
     advantages: torch.Tensor, weights: tuple[float, ...], std_floor: float
 ) -> torch.Tensor:
-    """Normalise each group over the rollout and add them with weights (omega_1, omega_2).
+    """Normalise each group over all ranks and add them with weights (omega_1, omega_2).
 
     The floor keeps a reward group that never varies from being blown up to unit noise.
 
@@ -54,7 +56,8 @@ def mix_advantages(
     Returns:
         (T, N, 1).
     """
-    mean = advantages.mean(dim=(0, 1))
-    std = advantages.std(dim=(0, 1)).clamp(min=std_floor)
+    pool = distributed.gather(advantages, dim=1)
+    mean = pool.mean(dim=(0, 1))
+    std = pool.std(dim=(0, 1)).clamp(min=std_floor)
     omega = torch.tensor(weights, device=advantages.device)
     return ((advantages - mean) / std * omega).sum(dim=-1, keepdim=True)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import torch
 
+from kiras_rl import distributed
 from kiras_rl.config import ConfigError
 from kiras_rl.schema import PremiumConfig
 
@@ -129,12 +130,13 @@ class PremiumSelector:
             setattr(self, name, torch.where(mask, 0.0, getattr(self, name)))
 
     def select(self, iteration: int) -> None:
-        """Move the best windows of the last rollout into the buffer."""
+        """Move the best windows of the last rollout, of all ranks, into the buffer of each."""
         config, skills = self._config, len(self._keyframes)
         of_skill = self._completed_skill[None] == torch.arange(
             skills, device=self.scores.device
         ).unsqueeze(1)
-        scores = torch.where(of_skill, self._completed_score[None], -torch.inf)  # (S, N)
+        scores = torch.where(of_skill, self._completed_score[None], -torch.inf)
+        scores = distributed.gather(scores, dim=1)  # (S, N of all ranks)
         if config.rule == "record":
             scores = torch.where(scores > self.scores[:, :1], scores, -torch.inf)
         else:
@@ -146,11 +148,14 @@ class PremiumSelector:
         self._completed_score.fill_(-torch.inf)
 
     def _windows(self, worlds: torch.Tensor) -> torch.Tensor:
-        """Return the completed windows of the given worlds (S, k), (S, k, W, D)."""
-        length, window = self._frames.shape[1], self._config.window
-        back = torch.arange(window - 1, -1, -1, device=worlds.device)
+        """Return the completed windows of the given worlds (S, k) of all ranks, (S, k, W, D)."""
+        num_worlds, length = self._frames.shape[:2]
+        mine = worlds // num_worlds == distributed.rank()
+        worlds = worlds % num_worlds
+        back = torch.arange(self._config.window - 1, -1, -1, device=worlds.device)
         positions = (self._completed_at[worlds].unsqueeze(-1) - back) % length
-        return self._frames[worlds.unsqueeze(-1), positions]
+        windows = self._frames[worlds.unsqueeze(-1), positions]
+        return distributed.total(torch.where(mine[..., None, None], windows, 0.0))
 
     def _insert(self, scores: torch.Tensor, windows: torch.Tensor, iteration: int) -> None:
         born = torch.full_like(scores, iteration, dtype=torch.int64)
@@ -192,8 +197,12 @@ class PremiumSelector:
         state = {k: v for k, v in vars(self).items() if isinstance(v, torch.Tensor)}
         return state | {"_position": self._position}
 
+    def world_state(self) -> dict:
+        """Return the recorder, which belongs to the worlds of this rank."""
+        return {k: v for k, v in self.state_dict().items() if k.startswith("_")}
+
     def load_state_dict(self, state: dict) -> None:
-        """Go on from a saved state."""
+        """Go on from a saved state, or from that of the recorder alone."""
         for name, value in state.items():
             is_tensor = isinstance(value, torch.Tensor)
             setattr(self, name, value.to(self.scores.device) if is_tensor else value)

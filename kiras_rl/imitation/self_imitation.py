@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from tensordict import TensorDict
 
+from kiras_rl import distributed
 from kiras_rl import interfaces as names
 from kiras_rl.algorithms.losses import discriminator_loss, gradient_penalty
 from kiras_rl.algorithms.storage import GroupRolloutStorage
@@ -145,13 +146,15 @@ class SelfImitation:
             )
         self.optimizer.zero_grad()
         loss.backward()
+        distributed.average_gradients(self.discriminator.parameters())
         self.optimizer.step()
         return loss.detach(), expert_score.detach(), policy_score.detach()
 
     def _describe(self, one_hot: torch.Tensor) -> dict[str, float]:
         """Return the mean imitation reward of each skill over the rollout."""
-        count = one_hot.sum(dim=(0, 1)).clamp(min=1.0)
-        means = (self._rewards.unsqueeze(-1) * one_hot).sum(dim=(0, 1)) / count
+        count = distributed.total(one_hot.sum(dim=(0, 1))).clamp(min=1.0)
+        sums = distributed.total((self._rewards.unsqueeze(-1) * one_hot).sum(dim=(0, 1)))
+        means = sums / count
         return _by_skill("Imitation/reward", self._skills, means)
 
     def _describe_buffer(self, iteration: int) -> dict[str, float]:
