@@ -7,8 +7,9 @@ from functools import cache
 import numpy as np
 
 from kiras_rl.envs.quadruped import QuadrupedEnv
+from kiras_rl.evaluation.terrain import Obstacle
 from kiras_rl.tools.protocols import imitation
-from kiras_rl.tools.protocols.crossing import Obstacle, cross, percent, pooled, share
+from kiras_rl.tools.protocols.crossing import count, percent, pooled, share
 from kiras_rl.tools.protocols.pooling import pool
 from kiras_rl.tools.protocols.rows import panels
 from kiras_rl.tools.protocols.subject import Subject
@@ -47,7 +48,7 @@ def measure(subject: Subject) -> dict:
             )
 
             def run(part: int = part, index: int = index) -> dict:
-                return cross(build(part), subject, [obstacle], part, index)[0]
+                return count(build(part), subject, [obstacle], part, index)[0]
 
             results.append(subject.ledger.get(key, run))
         return pool(results)

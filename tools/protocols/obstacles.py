@@ -5,9 +5,9 @@ from __future__ import annotations
 from functools import cache
 
 from kiras_rl.envs.quadruped import QuadrupedEnv
-from kiras_rl.evaluation.terrain import TIME_LIMIT
+from kiras_rl.evaluation.terrain import TIME_LIMIT, Obstacle
 from kiras_rl.tools.evaluator import make_evaluation_env
-from kiras_rl.tools.protocols.crossing import Obstacle, cross, share
+from kiras_rl.tools.protocols.crossing import count, share
 from kiras_rl.tools.protocols.rows import colours, panels
 from kiras_rl.tools.protocols.subject import Subject
 from kiras_rl.tools.report.content import Column, Figure, Section, Table
@@ -51,7 +51,7 @@ def measure(subject: Subject) -> dict:
 
     def counts(course: str) -> dict:
         sizes, obstacles = zip(*COURSES[course], strict=True)
-        cells = cross(build(obstacles[0].terrain), subject, list(obstacles), trials)
+        cells = count(build(obstacles[0].terrain), subject, list(obstacles), trials)
         return dict(zip(map(str, sizes), cells, strict=True))
 
     def key(course: str) -> str:
