@@ -8,10 +8,10 @@ from pathlib import Path
 
 from kiras_rl.config import ConfigError
 from kiras_rl.tools.evaluate import (
-    MISTAKES,
     add_options,
     console,
     default_protocols,
+    exit_code,
     measure,
     options_of,
 )
@@ -42,15 +42,9 @@ examples:
 def main(argv: list[str] | None = None) -> int:
     """Run the command; return its exit code."""
     args = _parse(argv)
-    try:
-        compare(load(args.policies, options_of(args)), args.protocol, args.out)
-    except MISTAKES as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        print("stopped; the same command goes on from here", file=sys.stderr)
-        return 130
-    return 0
+    return exit_code(
+        lambda: compare(load(args.policies, options_of(args)), args.protocol, args.out)
+    )
 
 
 def _parse(argv: list[str] | None) -> argparse.Namespace:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 from rich.console import Console
@@ -56,12 +57,25 @@ console = Console()
 def main(argv: list[str] | None = None) -> int:
     """Run the command; return its exit code."""
     args = _parse(argv)
-    try:
+
+    def work() -> None:
         subject = Subject.load(args.policy, args.robot, args.out, options_of(args))
         names = args.protocol or default_protocols(subject)
         if names == ALL and run_of(subject.source) is None:
             names = [name for name in names if name != "sampling"]  # which only a run can tell
         evaluate(subject, names)
+
+    return exit_code(work)
+
+
+def exit_code(work: Callable[[], object]) -> int:
+    """Do the work of a command; a mistake of the user's and Ctrl-C are one line each.
+
+    Returns:
+        0 where it was done, 2 after a mistake, 130 after Ctrl-C.
+    """
+    try:
+        work()
     except MISTAKES as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
