@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from rich.console import Console
-from rich.progress import Progress
+from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 
 from kiras_rl.checkpoint import CheckpointError
 from kiras_rl.config import ConfigError
@@ -100,17 +100,35 @@ def evaluate(subject: Subject, names: list[str]) -> Path:
     return page
 
 
-def measure(subjects: list[Subject], names: list[str]):  # noqa: ANN201
-    """Yield the name of each protocol and its values for every subject, under a progress bar."""
-    with Progress(console=console, transient=True) as progress:
-        task = progress.add_task("", total=len(names) * len(subjects))
-        for name in names:
+def measure(subjects: list[Subject], names: list[str]) -> Iterator[tuple[str, list[dict]]]:
+    """Yield the name of each protocol and its values for every subject.
+
+    A bar shows how much of a protocol is done, and the time left; a file gets a line a protocol.
+    """
+    with _bar() as bar:
+        for number, name in enumerate(names, start=1):
+            title = f"{name} ({number} of {len(names)})"
+            if bar.disable:
+                console.print(f"measuring {title}", highlight=False)
             values = []
             for subject in subjects:
-                progress.update(task, description=f"{name}: {subject.label}")
+                task = bar.add_task(f"{title}: {subject.label}", total=1.0)
+                subject.progress.show = lambda share, task=task: bar.update(task, completed=share)
                 values.append(PROTOCOLS[name].measure(subject))
-                progress.advance(task)
+                bar.remove_task(task)
             yield name, values
+
+
+def _bar() -> Progress:
+    columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn())
+    return Progress(
+        *columns,
+        TimeRemainingColumn(),
+        console=console,
+        transient=True,
+        refresh_per_second=2,
+        disable=not console.is_terminal,
+    )
 
 
 def default_protocols(subject: Subject) -> list[str]:

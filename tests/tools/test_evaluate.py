@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import io
 import json
 import shutil
 
 import pytest
+from rich.console import Console
 
-from kiras_rl.tools import compare
+from kiras_rl.tools import compare, evaluate
 from kiras_rl.tools.evaluate import main
 from kiras_rl.tools.policy_files import shipped_policy
+from kiras_rl.tools.protocols import PROTOCOLS
+from kiras_rl.tools.protocols.subject import Options, Subject
 
 SKILLS = ["walk", "crawl", "stilt", "pitch_up", "pitch_down"]
 FEW = ["--robots", "2", "--trials", "1", "--duration", "2"]
@@ -86,6 +90,39 @@ def test_policies_are_set_side_by_side_and_seeds_pooled(tmp_path, capsys, monkey
     assert (tmp_path / "ours/seed_1/evaluation/results.json").is_file()
     assert compare.main(["x=one.onnx", "x=one.onnx"]) == 2
     assert "two policies are called 'x'" in capsys.readouterr().err
+
+
+def test_progress_moves_with_every_step(tmp_path):
+    options = Options(robots=1, duration=2.0, backend="native")
+    subject, shares = Subject.load(None, None, tmp_path, options), []
+    subject.progress.show = shares.append
+    PROTOCOLS["flat"].measure(subject)
+    # 100 steps of an episode that has a second to spare
+    assert shares == pytest.approx([step / 150 for step in range(1, 101)])
+
+
+def test_progress_counts_what_is_still_to_be_measured(tmp_path):
+    subject, shares = Subject.load(None, None, tmp_path, Options()), []
+    subject.progress.show = shares.append
+    subject.ledger.get("known", dict)
+
+    def half():
+        subject.progress.tell(0.5)
+        return {}
+
+    subject.results({"known": half, "first": half, "second": half})
+    assert shares == [0.25, 0.75]
+
+
+def test_a_terminal_shows_a_bar_and_a_file_a_line_a_protocol(tmp_path, capsys, monkeypatch):
+    command = ["--protocol", "flat", *FEW, "--out", str(tmp_path)]
+    screen = Console(file=io.StringIO(), force_terminal=True, width=120)
+    with monkeypatch.context() as patch:
+        patch.setattr(evaluate, "console", screen)
+        assert main(command) == 0
+    assert "flat (1 of 1): solo8/flat" in screen.file.getvalue()
+    assert main(command) == 0
+    assert capsys.readouterr().out.startswith("measuring flat (1 of 1)\n")
 
 
 @pytest.mark.parametrize("option", ["--robots", "--trials"])

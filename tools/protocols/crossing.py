@@ -31,7 +31,7 @@ def count(
     Returns:
         For each obstacle: skill -> counts of trials, successes, strict successes and falls.
     """
-    outcomes = cross(env, subject.policy, obstacles, trials, SPEEDS, SEED + part)
+    outcomes = cross(env, subject.policy_in(env), obstacles, trials, SPEEDS, SEED + part)
     counts = {kind: flags.sum(dim=-1).tolist() for kind, flags in vars(outcomes).items()}
     return [
         {

@@ -42,13 +42,13 @@ def measure(subject: Subject) -> dict:
     def run() -> dict:
         worlds = options.robots * len(subject.skills)
         env = make_evaluation_env(subject.flat(), worlds, options.duration, options.device)
-        results = evaluate_skills(env, subject.policy, options.duration, options.command)
+        results = evaluate_skills(env, subject.policy_in(env), options.duration, options.command)
         return {name: asdict(result) for name, result in results.items()}
 
     key = subject.key(
         "flat", robots=options.robots, duration=options.duration, command=options.command
     )
-    return {"skills": subject.ledger.get(key, run)}
+    return {"skills": subject.results({key: run})[key]}
 
 
 def section(results: dict[str, dict]) -> Section:

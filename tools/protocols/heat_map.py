@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from functools import cache
+from collections.abc import Callable, Iterator
+from functools import cache, partial
 
 import numpy as np
 
@@ -34,44 +35,36 @@ CHUNK = 200  # trials of a skill at a time: an interruption loses no more
 
 def measure(subject: Subject) -> dict:
     """Return the counts of each obstacle and skill, and the cosines."""
-
-    @cache
-    def build(trials: int) -> QuadrupedEnv:
-        return terrain_env(subject, trials)
-
-    def counts(obstacle: Obstacle, trials: int) -> dict:
-        parts = [min(CHUNK, trials - done) for done in range(0, trials, CHUNK)]
-        results = []
-        for index, part in enumerate(parts):
-            key = subject.key(
-                "heat_map", type=obstacle.terrain, level=obstacle.level, part=index, trials=part
-            )
-
-            def run(part: int = part, index: int = index) -> dict:
-                return count(build(part), subject, [obstacle], part, index)[0]
-
-            results.append(subject.ledger.get(key, run))
-        return pool(results)
-
-    options = subject.options
+    build, trials = cache(partial(terrain_env, subject)), subject.options.trials_or
+    wanted = dict.fromkeys(HEADLINE.values(), trials(HEADLINE_TRIALS))
+    wanted |= dict.fromkeys(OTHERS, trials(OTHER_TRIALS))
+    parts = {o: dict(_parts(subject, build, o, number)) for o, number in wanted.items()}
+    pieces = {key: run for runs in parts.values() for key, run in runs.items()}
+    on_flat, run = imitation.piece(subject)
+    results = subject.results(pieces | {on_flat: run})
+    cells = {obstacle: pool([results[key] for key in keys]) for obstacle, keys in parts.items()}
     return {
         "terrain": _lengths(subject),
-        "headline": {
-            name: counts(obstacle, options.trials_or(HEADLINE_TRIALS))
-            for name, obstacle in HEADLINE.items()
-        },
-        "others": [
-            {
-                "type": obstacle.terrain,
-                "level": obstacle.level,
-                "cells": counts(obstacle, options.trials_or(OTHER_TRIALS)),
-            }
-            for obstacle in OTHERS
-        ],
-        "cosine": {
-            name: values["cosine"] for name, values in imitation.measure(subject)["skills"].items()
-        },
+        "headline": {name: cells[obstacle] for name, obstacle in HEADLINE.items()},
+        "others": [{"type": o.terrain, "level": o.level, "cells": cells[o]} for o in OTHERS],
+        "cosine": {name: values["cosine"] for name, values in results[on_flat]["skills"].items()},
     }
+
+
+def _parts(
+    subject: Subject, build: Callable[[int], QuadrupedEnv], obstacle: Obstacle, trials: int
+) -> Iterator[tuple[str, Callable[[], dict]]]:
+    """Yield the key of each CHUNK of trials, and what measures it."""
+
+    def run(number: int, index: int) -> dict:
+        return count(build(number), subject, [obstacle], number, index)[0]
+
+    for index, done in enumerate(range(0, trials, CHUNK)):
+        number = min(CHUNK, trials - done)
+        key = subject.key(
+            "heat_map", type=obstacle.terrain, level=obstacle.level, part=index, trials=number
+        )
+        yield key, partial(run, number, index)
 
 
 def _lengths(subject: Subject) -> dict[str, list[float]]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from functools import cache
+from functools import cache, partial
 
 from kiras_rl.envs.quadruped import QuadrupedEnv
 from kiras_rl.evaluation.terrain import TIME_LIMIT, Obstacle
@@ -54,15 +54,14 @@ def measure(subject: Subject) -> dict:
         cells = count(build(obstacles[0].terrain), subject, list(obstacles), trials)
         return dict(zip(map(str, sizes), cells, strict=True))
 
-    def key(course: str) -> str:
-        return subject.key("obstacles", course=course.replace(" ", "_"), trials=trials)
-
+    keys = {
+        course: subject.key("obstacles", course=course.replace(" ", "_"), trials=trials)
+        for course in COURSES
+    }
+    results = subject.results({key: partial(counts, course) for course, key in keys.items()})
     return {
         "scale": subject.rough().env.terrain.scale,
-        "courses": {
-            course: subject.ledger.get(key(course), lambda course=course: counts(course))
-            for course in COURSES
-        },
+        "courses": {course: results[key] for course, key in keys.items()},
     }
 
 

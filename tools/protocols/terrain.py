@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from functools import cache
+from functools import cache, partial
 
 from kiras_rl.envs.quadruped import QuadrupedEnv
 from kiras_rl.evaluation.terrain import TIME_LIMIT, Obstacle, TerrainResult, rough_types
@@ -38,15 +38,9 @@ def measure(subject: Subject) -> dict:
         obstacles = [Obstacle(name, number) for name in names]
         return dict(zip(names, count(build(), subject, obstacles, trials), strict=True))
 
-    def key(number: int) -> str:
-        return subject.key("terrain", level=number, trials=trials)
-
-    return {
-        "levels": {
-            str(number): subject.ledger.get(key(number), lambda number=number: level(number))
-            for number in options.levels
-        }
-    }
+    keys = {n: subject.key("terrain", level=n, trials=trials) for n in options.levels}
+    results = subject.results({key: partial(level, number) for number, key in keys.items()})
+    return {"levels": {str(number): results[key] for number, key in keys.items()}}
 
 
 def terrain_env(subject: Subject, trials: int) -> QuadrupedEnv:
