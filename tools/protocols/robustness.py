@@ -70,7 +70,7 @@ def sweeps(config: Config) -> list[Sweep]:
             setter("payload"),
         ),
         Sweep(
-            "friction", "", (1.25, 0.8, 0.5, 0.4, 0.3, 0.2, 0.1), drawn.friction, setter("friction")
+            "friction", "", (1.25, 0.8, 0.5, 0.2, 0.1, 0.05, 0.02), drawn.friction, setter("friction")
         ),
         Sweep(
             "delay",
