@@ -240,9 +240,8 @@ class QuadrupedEnv(SkillEnv):
         self._randomizer.reset(mask)
         if self._curriculum:
             placed = self._placed is not None
-            self._write_terrain(
-                mask, self._placed if placed else self._curriculum.tiles(self.task.skill)
-            )
+            tile = self._placed if placed else self._curriculum.tiles(self.task.skill)
+            self._write_terrain(mask, tile)
         qpos, qvel = self._postures.draw_begin(start, self._random)
         joint_pos = qpos[:, 7:]
         self.sim.write_state(mask, qpos, qvel, joint_pos)
@@ -343,6 +342,10 @@ class QuadrupedEnv(SkillEnv):
     def measure(self) -> Measurements:
         """Return the measurements of the last step, before its resets."""
         return self._measurements
+
+    def foot_pos_b(self, joint_pos: torch.Tensor) -> torch.Tensor:
+        """Return the centres of the feet in the base frame, (N, F, 3), m."""
+        return self._kinematics.foot_pos_b(joint_pos)
 
     def foot_height_b(self, gravity_b: torch.Tensor, joint_pos: torch.Tensor) -> torch.Tensor:
         """Return the height of each foot's lowest point above the base, (N, F), m."""

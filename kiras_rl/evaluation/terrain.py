@@ -7,7 +7,8 @@ from dataclasses import dataclass
 
 import torch
 
-from kiras_rl.evaluation.flat import SEED, Policy
+from kiras_rl.evaluation.flat import FLOOR, SEED, Policy, mean_where, posture_errors
+from kiras_rl.evaluation.stance import Stance
 from kiras_rl.interfaces import SkillEnv
 
 RADIUS = 3.0  # m from the middle of the tile, beyond all but the last obstacles: crossed
@@ -57,11 +58,14 @@ class Outcomes:
     Attributes:
         success: Went RADIUS far within PATIENCE times the duration of the way and TIME_LIMIT.
         strict: And did so with thighs or shanks on the ground in at most LIMB_SHARE of the steps.
+        kept: Succeeded, and kept the skill's keyframe on the way: mean errors of the moving
+            averages of height and pitch over its Stance are at most those of FLOOR.
         fell: Fell before either.
     """
 
     success: torch.Tensor
     strict: torch.Tensor
+    kept: torch.Tensor
     fell: torch.Tensor
 
 
@@ -86,17 +90,35 @@ def run_trials(env: SkillEnv, policy: Policy, trials: Trials, seed: int = SEED) 
     limit = (PATIENCE * RADIUS / trials.speed).clamp(max=TIME_LIMIT) / env.step_dt
     success = torch.zeros(env.num_envs, dtype=torch.bool, device=env.device)
     fell, limb_steps, steps = success.clone(), torch.zeros_like(limit), torch.zeros_like(limit)
+    stance, postures = Stance(env, trials.skill), []
     for step in range(int(limit.max().ceil())):
         obs = env.step(policy(obs))[0]
         now = env.measure()
         running = ~success & ~fell & (step < limit)
+        postures.append((*stance.read(now), running))
         steps += running
         limb_steps += running & now.limb_contact
         fell |= running & now.fallen
         success |= running & ~now.fallen & (now.distance >= RADIUS)
         if step % 25 == 0 and not (~success & ~fell & (step < limit)).any():
             break
-    return Outcomes(success, success & (limb_steps <= LIMB_SHARE * steps), fell)
+    return Outcomes(
+        success=success,
+        strict=success & (limb_steps <= LIMB_SHARE * steps),
+        kept=success & _keeps(env, trials.skill, postures),
+        fell=fell,
+    )
+
+
+def _keeps(
+    env: SkillEnv, skill: torch.Tensor, postures: list[tuple[torch.Tensor, ...]]
+) -> torch.Tensor:
+    """Return who kept its keyframe, (N,) bool, from height, pitch and "running" of each step."""
+    height, pitch, running = (torch.stack(x) for x in zip(*postures, strict=True))
+    height_error, pitch_error = (
+        mean_where(error, running.float()) for error in posture_errors(height, pitch, skill, env)
+    )
+    return (height_error <= FLOOR["height"]) & (pitch_error <= FLOOR["pitch"])
 
 
 @dataclass(frozen=True)

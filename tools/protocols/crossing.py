@@ -29,7 +29,7 @@ def count(
         part: Which of several draws of robots and headings.
 
     Returns:
-        For each obstacle: skill -> counts of trials, successes, strict successes and falls.
+        For each obstacle: skill -> counts of trials, and of each of the Outcomes.
     """
     outcomes = cross(env, subject.policy_in(env), obstacles, trials, SPEEDS, SEED + part)
     counts = {kind: flags.sum(dim=-1).tolist() for kind, flags in vars(outcomes).items()}

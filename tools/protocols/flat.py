@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 from dataclasses import asdict
 
-from kiras_rl.evaluation.flat import SkillResult, evaluate_skills
-from kiras_rl.tools.evaluator import FLOOR, make_evaluation_env
+from kiras_rl.evaluation.flat import FLOOR, SkillResult, evaluate_skills
+from kiras_rl.tools.evaluator import make_evaluation_env
 from kiras_rl.tools.protocols.rows import skill_table
 from kiras_rl.tools.protocols.subject import Subject
 from kiras_rl.tools.report.content import Cell, Column, Section, Table

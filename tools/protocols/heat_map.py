@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from functools import cache, partial
 
 import numpy as np
 
 from kiras_rl.envs.quadruped import QuadrupedEnv
+from kiras_rl.evaluation.flat import FLOOR
 from kiras_rl.evaluation.terrain import Obstacle
 from kiras_rl.tools.protocols import imitation
 from kiras_rl.tools.protocols.crossing import count, percent, pooled, share
@@ -21,7 +23,9 @@ TITLE = "Heat map: steps and discrete footholds"
 TEXT = (
     "As the protocol terrain, on steps (S) and discrete footholds (D), with many trials, and the "
     "cosine to the keyframe on flat ground (C) beside them. Headline: steps of 6 cm, gaps of 8 cm "
-    "(times the scale of the robot's terrain)."
+    "(times the scale of the robot's terrain). Kept: crossed in the skill's own keyframe, with "
+    "mean errors of height and pitch over the ground it stands on of at most "
+    f"{100 * FLOOR['height']:.0f} cm and {math.degrees(FLOOR['pitch']):.0f} degrees."
 )
 
 HEADLINE = {"S": Obstacle("stairs", 4), "D": Obstacle("footholds", 5)}
@@ -62,7 +66,12 @@ def _parts(
     for index, done in enumerate(range(0, trials, CHUNK)):
         number = min(CHUNK, trials - done)
         key = subject.key(
-            "heat_map", type=obstacle.terrain, level=obstacle.level, part=index, trials=number
+            "heat_map",
+            type=obstacle.terrain,
+            level=obstacle.level,
+            part=index,
+            trials=number,
+            kept=f"{100 * FLOOR['height']:g}cm,{math.degrees(FLOOR['pitch']):g}deg",
         )
         yield key, partial(run, number, index)
 
@@ -81,7 +90,7 @@ def section(results: dict[str, dict]) -> Section:
     """Return the heat maps, the shares with their intervals, and the other levels."""
     tables = [_headline(name, results) for name in HEADLINE]
     tables += [_others(label, values) for label, values in results.items()]
-    figures = [_figure(kind, results) for kind in ("success", "strict")]
+    figures = [_figure(kind, results) for kind in ("success", "strict", "kept")]
     return Section("heat_map", TITLE, TEXT, tables, figures)
 
 
@@ -99,6 +108,7 @@ def _headline(name: str, results: dict[str, dict]) -> Table:
             label,
             percent(counts, "success"),
             percent(counts, "strict"),
+            percent(counts, "kept"),
             100 * share(counts, "fell"),
             counts["trials"],
         )
@@ -110,6 +120,7 @@ def _headline(name: str, results: dict[str, dict]) -> Table:
         Column("policy"),
         Column("success", "%"),
         Column("strict", "%"),
+        Column("kept", "%"),
         Column("falls", "%", "{:.0f}"),
         Column("trials", form="{}"),
     )
@@ -125,12 +136,12 @@ def _others(label: str, values: dict) -> Table:
     rows, skills = [], list(values["headline"]["S"])
     for cell in values["others"]:
         shares = [
-            f"{100 * share(c, 'success'):.0f} ({100 * share(c, 'strict'):.0f})"
+            " / ".join(f"{100 * share(c, kind):.0f}" for kind in ("success", "strict", "kept"))
             for c in _with_all(cell["cells"]).values()
         ]
         rows.append((_size(values, cell["type"], cell["level"]), *shares))
     columns = (Column("obstacle"), *map(Column, skills), Column("all"))
-    return Table(f"Other sizes: {label}", columns, rows, "Success in %, in brackets strict.")
+    return Table(f"Other sizes: {label}", columns, rows, "Success / strict / kept in %.")
 
 
 def _figure(kind: str, results: dict[str, dict]) -> Figure:

@@ -7,9 +7,9 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 
-from kiras_rl.evaluation.flat import deal_skills, per_robot, record
+from kiras_rl.evaluation.flat import FLOOR, deal_skills, per_robot, record
 from kiras_rl.schema import Config, RandomizationConfig
-from kiras_rl.tools.evaluator import FLOOR, make_evaluation_env
+from kiras_rl.tools.evaluator import make_evaluation_env
 from kiras_rl.tools.protocols.rows import colours, panels
 from kiras_rl.tools.protocols.subject import Subject
 from kiras_rl.tools.report.content import Column, Figure, Section, Table
@@ -70,7 +70,11 @@ def sweeps(config: Config) -> list[Sweep]:
             setter("payload"),
         ),
         Sweep(
-            "friction", "", (1.25, 0.8, 0.5, 0.2, 0.1, 0.05, 0.02), drawn.friction, setter("friction")
+            "friction",
+            "",
+            (1.25, 0.8, 0.5, 0.2, 0.1, 0.05, 0.02),
+            drawn.friction,
+            setter("friction"),
         ),
         Sweep(
             "delay",
