@@ -59,7 +59,7 @@ def config_from_dict(values: dict, overrides: list[str] | tuple[str, ...] = ()) 
     younger = OmegaConf.create()
     for key in OmegaConf.missing_keys(saved):
         OmegaConf.update(younger, key, OmegaConf.select(_base(), key))
-    return _resolve([values, younger], list(overrides), source)
+    return _resolve([younger], list(overrides), source, begin=saved)
 
 
 def config_from_layers(layers: list[dict], source: str) -> Config:

@@ -15,7 +15,7 @@ from kiras_rl.tools.evaluate import (
     measure,
     options_of,
 )
-from kiras_rl.tools.protocols import PROTOCOLS
+from kiras_rl.tools.protocols import PROTOCOLS, sampling
 from kiras_rl.tools.protocols.pooling import pool
 from kiras_rl.tools.protocols.subject import Options, Subject
 from kiras_rl.tools.report.about import about_table
@@ -96,7 +96,9 @@ def compare(methods: dict[str, list[Subject]], names: list[str] | None, out: Pat
     subjects = [subject for group in methods.values() for subject in group]
     if names is None:
         wanted = {name for subject in subjects for name in default_protocols(subject)}
-        names = [name for name in PROTOCOLS if name in wanted - {"sampling"}]
+        if not all(map(sampling.is_known, subjects)):
+            wanted -= {"sampling"}
+        names = [name for name in PROTOCOLS if name in wanted]
     sections: list[Section] = []
     page = out
     for name, values in measure(subjects, names):

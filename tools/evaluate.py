@@ -14,8 +14,7 @@ from kiras_rl.checkpoint import CheckpointError
 from kiras_rl.config import ConfigError
 from kiras_rl.deploy.metadata import PolicyError
 from kiras_rl.robots.robot import RobotError
-from kiras_rl.tools.protocols import PROTOCOLS
-from kiras_rl.tools.protocols.sampling import run_of
+from kiras_rl.tools.protocols import PROTOCOLS, sampling
 from kiras_rl.tools.protocols.subject import Options, Subject
 from kiras_rl.tools.protocols.terrain import LEVELS
 from kiras_rl.tools.report.about import about_table
@@ -61,8 +60,8 @@ def main(argv: list[str] | None = None) -> int:
     def work() -> None:
         subject = Subject.load(args.policy, args.robot, args.out, options_of(args))
         names = args.protocol or default_protocols(subject)
-        if names == ALL and run_of(subject.source) is None:
-            names = [name for name in names if name != "sampling"]  # which only a run can tell
+        if names == ALL and not sampling.is_known(subject):
+            names = [name for name in names if name != "sampling"]
         evaluate(subject, names)
 
     return exit_code(work)
@@ -136,7 +135,7 @@ def default_protocols(subject: Subject) -> list[str]:
     names = ["flat", "imitation", "transitions"]
     if subject.is_finetuned:
         names.append("terrain")
-    return names + (["sampling"] if run_of(subject.source) else [])
+    return names + (["sampling"] if sampling.is_known(subject) else [])
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import io
 import json
 import shutil
@@ -9,7 +10,8 @@ import shutil
 import pytest
 from rich.console import Console
 
-from kiras_rl.tools import compare, evaluate
+from kiras_rl.tools import compare, evaluate, train
+from kiras_rl.tools.curves import read_scalars
 from kiras_rl.tools.evaluate import main
 from kiras_rl.tools.policy_files import shipped_policy
 from kiras_rl.tools.protocols import PROTOCOLS
@@ -43,7 +45,11 @@ def test_the_imitation_protocol_measures_the_shipped_policy(tmp_path, capsys):
         assert 1.0 < result["power"] < 15.0
 
 
-def test_terrain_is_crossed_level_by_level_and_gives_the_same_numbers_again(tmp_path, capsys):
+def test_terrain_is_crossed_level_by_level_and_gives_the_same_numbers_again(
+    tmp_path, capsys, monkeypatch
+):
+    monkeypatch.setattr("kiras_rl.evaluation.terrain.RADIUS", 0.8)  # m
+    monkeypatch.setattr("kiras_rl.evaluation.terrain.TIME_LIMIT", 4.0)  # s
     command = ["--protocol", "terrain", "--levels", "0,1", "--trials", "1"]
     assert main([*command, "--out", str(tmp_path / "a")]) == 0
     assert "Level 0" in capsys.readouterr().out
@@ -62,7 +68,8 @@ def test_terrain_is_crossed_level_by_level_and_gives_the_same_numbers_again(tmp_
     assert again == {key: found[key] for key in again}
 
 
-def test_transitions_are_measured_on_both_grounds(tmp_path):
+def test_transitions_are_measured_on_both_grounds(tmp_path, monkeypatch):
+    monkeypatch.setattr(PROTOCOLS["transitions"], "HOLD", 1.5)  # s
     assert main(["--protocol", "transitions", "--trials", "1", "--out", str(tmp_path)]) == 0
     found = results(tmp_path, "transitions")
     assert len(found) == 3
@@ -70,8 +77,8 @@ def test_transitions_are_measured_on_both_grounds(tmp_path):
     assert flat["settled"][0][1] == 1.0 and flat["settled"][0][0] is None
     trace = next(value for key, value in found.items() if "/trace" in key)
     assert trace["order"] == [*SKILLS, "walk"]
-    assert trace["height"]["mean"][140] == pytest.approx(0.2, abs=0.02)  # of walking, at 2.8 s
-    assert trace["height"]["mean"][290] == pytest.approx(0.1, abs=0.02)  # of crawling
+    assert trace["height"]["mean"][70] == pytest.approx(0.2, abs=0.02)  # of walking, at 1.4 s
+    assert trace["height"]["mean"][145] == pytest.approx(0.1, abs=0.02)  # of crawling
 
 
 def test_policies_are_set_side_by_side_and_seeds_pooled(tmp_path, capsys, monkeypatch):
@@ -90,6 +97,24 @@ def test_policies_are_set_side_by_side_and_seeds_pooled(tmp_path, capsys, monkey
     assert (tmp_path / "ours/seed_1/evaluation/results.json").is_file()
     assert compare.main(["x=one.onnx", "x=one.onnx"]) == 2
     assert "two policies are called 'x'" in capsys.readouterr().err
+
+
+def test_skill_sampling_of_a_sweep_is_read_from_the_logs_of_its_seeds(tmp_path):
+    sweep = tmp_path / "a.yaml"
+    tiny = "num_envs=4, evaluation.interval=0, iterations=2, finetuning.iterations=1"
+    sweep.write_text(f"name: a\nconfigs: {{tiny: smoke}}\nseeds: [1, 2]\noverrides: [{tiny}]\n")
+    assert train.main(["--sweep", str(sweep), "--runs", str(tmp_path)]) == 0
+    runs = tmp_path / "sweeps/a/tiny"
+    command = [str(runs), "--protocol", "sampling", "--out", str(tmp_path / "page")]
+    assert compare.main(command) == 0
+    table = (tmp_path / "page/tables/sampling_probabilities.csv").read_text().splitlines()
+    assert len(table) == 1 + len(SKILLS)
+    for row, skill in zip(csv.reader(table[1:]), SKILLS, strict=True):
+        logs = [read_scalars(runs / f"seed_{k}")[f"Skill/probability_{skill}"] for k in (1, 2)]
+        assert row[:2] == ["tiny", skill]
+        assert [iterations for iterations, _ in logs] == 2 * [[1, 2, 3]]
+        end_of_learning, end = (sum(values[i] for _, values in logs) / 2 for i in (1, 2))
+        assert [float(x) for x in row[4:]] == pytest.approx([100 * end_of_learning, 100 * end])
 
 
 def test_progress_moves_with_every_step(tmp_path):
