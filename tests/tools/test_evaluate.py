@@ -48,8 +48,8 @@ def test_the_imitation_protocol_measures_the_shipped_policy(tmp_path, capsys):
 def test_terrain_is_crossed_level_by_level_and_gives_the_same_numbers_again(
     tmp_path, capsys, monkeypatch
 ):
-    monkeypatch.setattr("kiras_rl.evaluation.terrain.RADIUS", 0.8)  # m
-    monkeypatch.setattr("kiras_rl.evaluation.terrain.TIME_LIMIT", 4.0)  # s
+    monkeypatch.setattr("kiras_rl.evaluation.terrain.RADIUS", 0.6)  # m
+    monkeypatch.setattr("kiras_rl.evaluation.terrain.TIME_LIMIT", 3.0)  # s
     command = ["--protocol", "terrain", "--levels", "0,1", "--trials", "1"]
     assert main([*command, "--out", str(tmp_path / "a")]) == 0
     assert "Level 0" in capsys.readouterr().out
@@ -99,12 +99,12 @@ def test_policies_are_set_side_by_side_and_seeds_pooled(tmp_path, capsys, monkey
     assert "two policies are called 'x'" in capsys.readouterr().err
 
 
-def test_skill_sampling_of_a_sweep_is_read_from_the_logs_of_its_seeds(tmp_path):
-    sweep = tmp_path / "a.yaml"
-    tiny = "num_envs=4, evaluation.interval=0, iterations=2, finetuning.iterations=1"
-    sweep.write_text(f"name: a\nconfigs: {{tiny: smoke}}\nseeds: [1, 2]\noverrides: [{tiny}]\n")
-    assert train.main(["--sweep", str(sweep), "--runs", str(tmp_path)]) == 0
-    runs = tmp_path / "sweeps/a/tiny"
+def test_skill_sampling_is_read_from_the_logs_of_all_seeds(tmp_path, smoke_run):
+    runs, other = tmp_path / "tiny", ["--cfg", "smoke", "seed=2", "evaluation.interval=0"]
+    shutil.copytree(smoke_run, runs / "seed_1")
+    assert train.main([*other, "--runs", str(tmp_path)]) == 0
+    (run,) = (tmp_path / "smoke").iterdir()
+    run.rename(runs / "seed_2")
     command = [str(runs), "--protocol", "sampling", "--out", str(tmp_path / "page")]
     assert compare.main(command) == 0
     table = (tmp_path / "page/tables/sampling_probabilities.csv").read_text().splitlines()
@@ -112,8 +112,8 @@ def test_skill_sampling_of_a_sweep_is_read_from_the_logs_of_its_seeds(tmp_path):
     for row, skill in zip(csv.reader(table[1:]), SKILLS, strict=True):
         logs = [read_scalars(runs / f"seed_{k}")[f"Skill/probability_{skill}"] for k in (1, 2)]
         assert row[:2] == ["tiny", skill]
-        assert [iterations for iterations, _ in logs] == 2 * [[1, 2, 3]]
-        end_of_learning, end = (sum(values[i] for _, values in logs) / 2 for i in (1, 2))
+        assert [iterations for iterations, _ in logs] == 2 * [[1, 2, 3, 4]]
+        end_of_learning, end = (sum(values[i] for _, values in logs) / 2 for i in (1, 3))
         assert [float(x) for x in row[4:]] == pytest.approx([100 * end_of_learning, 100 * end])
 
 

@@ -25,20 +25,20 @@ class Protocol(NamedTuple):
 
 
 PROTOCOLS = {
-    "obstacles": Protocol(["--trials", "1"], results=3, stop=150),
-    "heat_map": Protocol(["--trials", "1", "--robots", "1"], results=9, stop=250),
-    "robustness": Protocol(["--robots", "1"], results=15, stop=120),
+    "obstacles": Protocol(["--trials", "1"], results=3, stop=75),
+    "heat_map": Protocol(["--trials", "1", "--robots", "1"], results=9, stop=125),
+    "robustness": Protocol(["--robots", "1"], results=15, stop=100),
 }
 
 
 @pytest.fixture(scope="module")
 def short():
-    """Let ways and times be short: 0.7 m within 2 s on terrain, 1.2 s of three values each."""
+    """Let ways and times be short: 0.35 m within 1 s on terrain, 1.1 s of three values each."""
     sweeps = robustness.sweeps
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("kiras_rl.evaluation.terrain.RADIUS", 0.7)
-        patch.setattr("kiras_rl.evaluation.terrain.TIME_LIMIT", 2.0)
-        patch.setattr(robustness, "DURATION", 1.2)
+        patch.setattr("kiras_rl.evaluation.terrain.RADIUS", 0.35)
+        patch.setattr("kiras_rl.evaluation.terrain.TIME_LIMIT", 1.0)
+        patch.setattr(robustness, "DURATION", 1.1)
         patch.setattr(
             robustness,
             "sweeps",
