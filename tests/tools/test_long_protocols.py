@@ -126,6 +126,8 @@ def check_heat_map(folder):
                 assert counts[shown] <= counts["success"]
             assert float(rows[skill]["falls [%]"]) == 100 * counts["fell"]
         assert rows["all"]["trials"] == "5"
+    page = (folder / "report.html").read_text()
+    assert all(f"Heat map: {kind}" in page for kind in ("success", "strict", "kept"))
     others = [*(f"steps of {x} cm" for x in ("4.0", "8.0", "10.0"))]
     others += [f"gaps of {x} cm" for x in ("5.6", "9.6", "12.0")]
     assert list(read(folder, "heat_map_other_sizes_solo8_flat")) == others
