@@ -342,6 +342,10 @@ class QuadrupedEnv(SkillEnv):
         """Return the measurements of the last step, before its resets."""
         return self._measurements
 
+    def foot_pos_b(self, joint_pos: torch.Tensor) -> torch.Tensor:
+        """Return the centres of the feet in the base frame, (N, F, 3), m."""
+        return self._kinematics.foot_pos_b(joint_pos)
+
     def foot_height_b(self, gravity_b: torch.Tensor, joint_pos: torch.Tensor) -> torch.Tensor:
         """Return the height of each foot's lowest point above the base, (N, F), m."""
         return self._kinematics.foot_height_b(gravity_b, joint_pos)

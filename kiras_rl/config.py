@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import difflib
 from dataclasses import asdict
 from functools import cache
@@ -17,6 +18,7 @@ from kiras_rl.schema import Config
 CFG_FOLDER = Path(__file__).resolve().parent / "cfg"
 if not CFG_FOLDER.is_dir():  # an editable install: kiras_rl.cfg is the top-level folder cfg/
     CFG_FOLDER = Path(__file__).resolve().parents[1] / "cfg"
+BASE = CFG_FOLDER / "base.yaml"
 SWEEP_FOLDER = CFG_FOLDER / "sweeps"  # lists of runs, see kiras_rl.tools.sweep
 
 MACHINE_KEYS = ("device", "sim.threads", "checkpoint_minutes")
@@ -40,7 +42,8 @@ def load_config(name: str, overrides: list[str] | tuple[str, ...] = ()) -> Confi
     Raises:
         ConfigError: Unknown file, unknown key, wrong type or missing value.
     """
-    return _resolve(_read_chain(name), list(overrides), source=name)
+    begin, layers = _read_chain(name)
+    return _resolve(layers, list(overrides), source=name, begin=begin)
 
 
 def config_from_dict(values: dict, overrides: list[str] | tuple[str, ...] = ()) -> Config:
@@ -52,12 +55,11 @@ def config_from_dict(values: dict, overrides: list[str] | tuple[str, ...] = ()) 
         ConfigError: As `load_config`.
     """
     source = "the saved configuration"
-    saved = _merge(_schema(), values, source)
-    base = OmegaConf.create(_read_chain("base")[0])
+    saved = _merge(copy.deepcopy(_schema()), values, source)
     younger = OmegaConf.create()
     for key in OmegaConf.missing_keys(saved):
-        OmegaConf.update(younger, key, OmegaConf.select(base, key))
-    return _resolve([values, younger], list(overrides), source)
+        OmegaConf.update(younger, key, OmegaConf.select(_base(), key))
+    return _resolve([younger], list(overrides), source, begin=saved)
 
 
 def config_from_layers(layers: list[dict], source: str) -> Config:
@@ -109,12 +111,21 @@ def _plain(value: Any) -> Any:
 
 @cache
 def _schema() -> DictConfig:
-    """Return the typed configuration without values: to merge into, never to change."""
+    """Return the typed configuration without values: to copy, never to change."""
     return OmegaConf.structured(Config)
 
 
-def _resolve(layers: list[dict], overrides: list[str], source: str) -> Config:
-    config = _schema()
+@cache
+def _base() -> DictConfig:
+    """Return cfg/base.yaml, which is most of any configuration: to copy, never to change."""
+    return _merge(copy.deepcopy(_schema()), _read(BASE), "base")
+
+
+def _resolve(
+    layers: list[dict], overrides: list[str], source: str, begin: DictConfig | None = None
+) -> Config:
+    """Put layers and overrides on top of `begin`, by default on nothing."""
+    config = copy.deepcopy(_schema() if begin is None else begin)
     for layer in layers:
         config = _merge(config, layer, source)
     for item in overrides:
@@ -149,9 +160,11 @@ def _parse_override(item: str) -> DictConfig:
 
 
 def _merge(config: DictConfig, layer: dict | DictConfig, source: str) -> DictConfig:
-    _check_keys(config, OmegaConf.create(layer), source)
+    """Return `config` with the values of `layer`; do not use what was given any more."""
+    layer = OmegaConf.create(layer)
+    _check_keys(config, layer, source)
     try:
-        return OmegaConf.merge(config, layer)
+        return OmegaConf.unsafe_merge(config, layer)
     except OmegaConfBaseException as error:
         raise ConfigError(_explain(error, source)) from None
 
@@ -174,27 +187,34 @@ def _check_keys(config: DictConfig, layer: DictConfig, source: str, prefix: str 
             _check_keys(known, child, source, f"{prefix}{key}.")
 
 
-def _read_chain(name: str) -> list[dict]:
-    """Return the layers from the root of `extends` down to `name`."""
+def _read_chain(name: str) -> tuple[DictConfig, list[dict]]:
+    """Return what `extends` begins with, base or nothing, and the layers from there to `name`."""
     layers, seen = [], []
     current: str | None = name
     while current is not None:
         path = _find(current, relative_to=seen[-1].parent if seen else None)
         if path in seen:
             raise ConfigError(f"'extends' goes round in circles: {path} is extended twice")
+        if path == BASE:
+            return _base(), layers[::-1]
         seen.append(path)
-        try:
-            values = OmegaConf.to_container(OmegaConf.load(path))
-        except Exception as error:
-            reason = " ".join(str(error).split())
-            raise ConfigError(f"{path} is not readable YAML: {reason}") from None
-        if not isinstance(values, dict):
-            raise ConfigError(f"{path} holds no keys: a configuration is a YAML mapping")
+        values = _read(path)
         current = values.pop("extends", None)
         if not isinstance(current, str | None):
             raise ConfigError(f"{path}: extends: give one name, not {current}")
         layers.append(values)
-    return layers[::-1]
+    return _schema(), layers[::-1]
+
+
+def _read(path: Path) -> dict:
+    try:
+        values = OmegaConf.to_container(OmegaConf.load(path))
+    except Exception as error:
+        reason = " ".join(str(error).split())
+        raise ConfigError(f"{path} is not readable YAML: {reason}") from None
+    if not isinstance(values, dict):
+        raise ConfigError(f"{path} holds no keys: a configuration is a YAML mapping")
+    return values
 
 
 def _find(name: str, relative_to: Path | None) -> Path:

@@ -193,6 +193,14 @@ class SkillEnv(VecEnv):
         """Return the measurements of the last step."""
 
     @abstractmethod
+    def foot_pos_b(self, joint_pos: torch.Tensor) -> torch.Tensor:
+        """Return the centres of the feet in the base frame, (N, F, 3), m.
+
+        Args:
+            joint_pos: Joint angles, (N, J), rad.
+        """
+
+    @abstractmethod
     def foot_height_b(self, gravity_b: torch.Tensor, joint_pos: torch.Tensor) -> torch.Tensor:
         """Return the height of each foot's lowest point above the base, (N, F), m.
 

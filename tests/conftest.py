@@ -44,6 +44,19 @@ def build_env():
 
 
 @pytest.fixture(scope="session")
+def smoke_run(tmp_path_factory):
+    """A finished run of cfg/smoke.yaml, for reading; copy it to go on with it."""
+    from kiras_rl.tools.train import main
+
+    runs, threads = tmp_path_factory.mktemp("runs"), torch.get_num_threads()
+    torch.set_num_threads(1)  # eight worlds are faster on one, much faster on a busy machine
+    assert main(["--cfg", "smoke", "--runs", str(runs)]) == 0
+    torch.set_num_threads(threads)
+    (run,) = (runs / "smoke").iterdir()
+    return run
+
+
+@pytest.fixture(scope="session")
 def make_metadata():
     """Describe a policy of Solo-8 that observes every term a robot can rebuild."""
     from kiras_rl.deploy.metadata import PolicyMetadata

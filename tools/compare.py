@@ -8,14 +8,14 @@ from pathlib import Path
 
 from kiras_rl.config import ConfigError
 from kiras_rl.tools.evaluate import (
-    MISTAKES,
     add_options,
     console,
     default_protocols,
+    exit_code,
     measure,
     options_of,
 )
-from kiras_rl.tools.protocols import PROTOCOLS
+from kiras_rl.tools.protocols import PROTOCOLS, sampling
 from kiras_rl.tools.protocols.pooling import pool
 from kiras_rl.tools.protocols.subject import Options, Subject
 from kiras_rl.tools.report.about import about_table
@@ -42,15 +42,9 @@ examples:
 def main(argv: list[str] | None = None) -> int:
     """Run the command; return its exit code."""
     args = _parse(argv)
-    try:
-        compare(load(args.policies, options_of(args)), args.protocol, args.out)
-    except MISTAKES as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        print("stopped; the same command goes on from here", file=sys.stderr)
-        return 130
-    return 0
+    return exit_code(
+        lambda: compare(load(args.policies, options_of(args)), args.protocol, args.out)
+    )
 
 
 def _parse(argv: list[str] | None) -> argparse.Namespace:
@@ -102,7 +96,9 @@ def compare(methods: dict[str, list[Subject]], names: list[str] | None, out: Pat
     subjects = [subject for group in methods.values() for subject in group]
     if names is None:
         wanted = {name for subject in subjects for name in default_protocols(subject)}
-        names = [name for name in PROTOCOLS if name in wanted - {"sampling"}]
+        if not all(map(sampling.is_known, subjects)):
+            wanted -= {"sampling"}
+        names = [name for name in PROTOCOLS if name in wanted]
     sections: list[Section] = []
     page = out
     for name, values in measure(subjects, names):

@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from rich.console import Console
-from rich.progress import Progress
+from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 
 from kiras_rl.checkpoint import CheckpointError
 from kiras_rl.config import ConfigError
 from kiras_rl.deploy.metadata import PolicyError
 from kiras_rl.robots.robot import RobotError
-from kiras_rl.tools.protocols import PROTOCOLS
-from kiras_rl.tools.protocols.sampling import run_of
+from kiras_rl.tools.protocols import PROTOCOLS, sampling
 from kiras_rl.tools.protocols.subject import Options, Subject
 from kiras_rl.tools.protocols.terrain import LEVELS
 from kiras_rl.tools.report.about import about_table
@@ -56,12 +56,25 @@ console = Console()
 def main(argv: list[str] | None = None) -> int:
     """Run the command; return its exit code."""
     args = _parse(argv)
-    try:
+
+    def work() -> None:
         subject = Subject.load(args.policy, args.robot, args.out, options_of(args))
         names = args.protocol or default_protocols(subject)
-        if names == ALL and run_of(subject.source) is None:
-            names = [name for name in names if name != "sampling"]  # which only a run can tell
+        if names == ALL and not sampling.is_known(subject):
+            names = [name for name in names if name != "sampling"]
         evaluate(subject, names)
+
+    return exit_code(work)
+
+
+def exit_code(work: Callable[[], object]) -> int:
+    """Do the work of a command; a mistake of the user's and Ctrl-C are one line each.
+
+    Returns:
+        0 where it was done, 2 after a mistake, 130 after Ctrl-C.
+    """
+    try:
+        work()
     except MISTAKES as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
@@ -86,17 +99,35 @@ def evaluate(subject: Subject, names: list[str]) -> Path:
     return page
 
 
-def measure(subjects: list[Subject], names: list[str]):  # noqa: ANN201
-    """Yield the name of each protocol and its values for every subject, under a progress bar."""
-    with Progress(console=console, transient=True) as progress:
-        task = progress.add_task("", total=len(names) * len(subjects))
-        for name in names:
+def measure(subjects: list[Subject], names: list[str]) -> Iterator[tuple[str, list[dict]]]:
+    """Yield the name of each protocol and its values for every subject.
+
+    A bar shows how much of a protocol is done, and the time left; a file gets a line a protocol.
+    """
+    with _bar() as bar:
+        for number, name in enumerate(names, start=1):
+            title = f"{name} ({number} of {len(names)})"
+            if bar.disable:
+                console.print(f"measuring {title}", highlight=False)
             values = []
             for subject in subjects:
-                progress.update(task, description=f"{name}: {subject.label}")
+                task = bar.add_task(f"{title}: {subject.label}", total=1.0)
+                subject.progress.show = lambda share, task=task: bar.update(task, completed=share)
                 values.append(PROTOCOLS[name].measure(subject))
-                progress.advance(task)
+                bar.remove_task(task)
             yield name, values
+
+
+def _bar() -> Progress:
+    columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn())
+    return Progress(
+        *columns,
+        TimeRemainingColumn(),
+        console=console,
+        transient=True,
+        refresh_per_second=2,
+        disable=not console.is_terminal,
+    )
 
 
 def default_protocols(subject: Subject) -> list[str]:
@@ -104,7 +135,7 @@ def default_protocols(subject: Subject) -> list[str]:
     names = ["flat", "imitation", "transitions"]
     if subject.is_finetuned:
         names.append("terrain")
-    return names + (["sampling"] if run_of(subject.source) else [])
+    return names + (["sampling"] if sampling.is_known(subject) else [])
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import math
 from collections.abc import Callable
 
 import torch
@@ -26,9 +25,6 @@ from kiras_rl.phases import FINETUNING, phase_config
 from kiras_rl.robots.robot import load_robot
 from kiras_rl.runner import Evaluators
 from kiras_rl.schema import Config
-
-FLOOR = {"height": 0.03, "pitch": math.radians(5.0), "velocity": 0.12, "falls": 0.05}
-"""What a skill must reach to be called learned: m, rad, m/s, share of robots."""
 
 
 def trained_config(metadata: PolicyMetadata) -> Config:

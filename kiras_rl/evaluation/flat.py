@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 
@@ -13,6 +14,9 @@ from kiras_rl.interfaces import Measurements, SkillEnv
 SETTLE = 1.0  # s that are not counted
 AVERAGE = 0.4  # s of the moving average of height and pitch: about two strides
 SEED = 12345  # every evaluation draws the same robots
+
+FLOOR = {"height": 0.03, "pitch": math.radians(5.0), "velocity": 0.12, "falls": 0.05}
+"""What a skill must reach to be called learned: m, rad, m/s, share of robots."""
 
 Policy = Callable[[TensorDict], torch.Tensor]
 
@@ -138,26 +142,41 @@ def summarize(recording: Recording, env: SkillEnv) -> dict[str, SkillResult]:
 
 def per_robot(recording: Recording, env: SkillEnv) -> dict[str, torch.Tensor]:
     """Return the fields of SkillResult for each robot, (N,) each."""
-    target_height = env.keyframe_height[recording.skill]
-    target_pitch = env.keyframe_pitch[recording.skill]
     start = round(SETTLE / recording.step_dt)
     alive = recording.alive[start:].float()
-    height = moving_average(recording.height, recording.step_dt)[start:]
-    pitch = moving_average(recording.pitch, recording.step_dt)[start:]
     velocity = recording.velocity[start:]
     values = {
-        "height": _mean(recording.height[start:], alive),
-        "pitch": _mean(recording.pitch[start:], alive),
-        "velocity": _mean(velocity, alive),
-        "height_error": _mean((height - target_height).abs(), alive),
-        "pitch_error": _mean((pitch - target_pitch).abs(), alive),
-        "velocity_error": _mean((velocity - recording.command[:, 0]).abs(), alive),
+        "height": mean_where(recording.height[start:], alive),
+        "pitch": mean_where(recording.pitch[start:], alive),
+        "velocity": mean_where(velocity, alive),
+        "velocity_error": mean_where((velocity - recording.command[:, 0]).abs(), alive),
         "lifts": lifts_per_second(
             recording.contact[start:], recording.alive[start:], recording.step_dt
         ).amin(dim=-1),
         "falls": 1.0 - recording.alive[-1].float(),
     }
+    errors = posture_errors(recording.height, recording.pitch, recording.skill, env)
+    for name, error in zip(("height_error", "pitch_error"), errors, strict=True):
+        values[name] = mean_where(error[start:], alive)
     return values | {"distinct": _distinct(values["height"], values["pitch"], recording, env)}
+
+
+def posture_errors(
+    height: torch.Tensor, pitch: torch.Tensor, skill: torch.Tensor, env: SkillEnv
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return how far moving averages are from their keyframes, (T, N) each, m and rad.
+
+    Args:
+        height: Above the ground, (T, N), m.
+        pitch: (T, N), rad.
+        skill: Whose keyframe, (N,).
+        env: With the keyframes.
+    """
+    height, pitch = (moving_average(signal, env.step_dt) for signal in (height, pitch))
+    return (
+        (height - env.keyframe_height[skill]).abs(),
+        (pitch - env.keyframe_pitch[skill]).abs(),
+    )
 
 
 def moving_average(signal: torch.Tensor, step_dt: float) -> torch.Tensor:
@@ -204,8 +223,8 @@ def as_scalars(results: dict[str, SkillResult]) -> dict[str, float]:
     return scalars
 
 
-def _mean(signal: torch.Tensor, alive: torch.Tensor) -> torch.Tensor:
-    """Average (T, N) over the steps before a fall; 0 steps give the value at the start."""
+def mean_where(signal: torch.Tensor, alive: torch.Tensor) -> torch.Tensor:
+    """Average (T, N) over the steps that count; 0 steps give the value at the start."""
     count = alive.sum(dim=0)
     mean = torch.where(alive > 0, signal, 0.0).sum(dim=0) / count.clamp(min=1.0)
     return torch.where(count > 0, mean, signal[0])

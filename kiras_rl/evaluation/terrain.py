@@ -7,13 +7,29 @@ from dataclasses import dataclass
 
 import torch
 
-from kiras_rl.evaluation.flat import SEED, Policy
+from kiras_rl.evaluation.flat import FLOOR, SEED, Policy, mean_where, posture_errors
+from kiras_rl.evaluation.stance import Stance
 from kiras_rl.interfaces import SkillEnv
 
 RADIUS = 3.0  # m from the middle of the tile, beyond all but the last obstacles: crossed
 TIME_LIMIT = 20.0  # s
 PATIENCE = 2.0  # times the duration of the way at the commanded speed
 LIMB_SHARE = 0.05  # of the steps with a thigh or shank on the ground, at most, to succeed strictly
+
+
+@dataclass(frozen=True)
+class Obstacle:
+    """A tile that robots try to cross.
+
+    Attributes:
+        terrain: Name of its type.
+        level: Of difficulty in the environment.
+        variant: Which of its tiles; None for all in turn.
+    """
+
+    terrain: str
+    level: int
+    variant: int | None = None
 
 
 @dataclass(frozen=True)
@@ -37,16 +53,19 @@ class Trials:
 
 @dataclass(frozen=True)
 class Outcomes:
-    """How the trials ended, (N,) bool each.
+    """How the trials ended, bool of one shape each.
 
     Attributes:
         success: Went RADIUS far within PATIENCE times the duration of the way and TIME_LIMIT.
         strict: And did so with thighs or shanks on the ground in at most LIMB_SHARE of the steps.
+        kept: Succeeded, and kept the skill's keyframe on the way: mean errors of the moving
+            averages of height and pitch over its Stance are at most those of FLOOR.
         fell: Fell before either.
     """
 
     success: torch.Tensor
     strict: torch.Tensor
+    kept: torch.Tensor
     fell: torch.Tensor
 
 
@@ -59,6 +78,9 @@ def run_trials(env: SkillEnv, policy: Policy, trials: Trials, seed: int = SEED) 
         policy: Observation -> mean actions.
         trials: What to try.
         seed: Of robots and headings.
+
+    Returns:
+        Outcomes of shape (N,).
     """
     command = torch.zeros(env.num_envs, 3, device=env.device)
     command[:, 0] = trials.speed
@@ -68,17 +90,35 @@ def run_trials(env: SkillEnv, policy: Policy, trials: Trials, seed: int = SEED) 
     limit = (PATIENCE * RADIUS / trials.speed).clamp(max=TIME_LIMIT) / env.step_dt
     success = torch.zeros(env.num_envs, dtype=torch.bool, device=env.device)
     fell, limb_steps, steps = success.clone(), torch.zeros_like(limit), torch.zeros_like(limit)
+    stance, postures = Stance(env, trials.skill), []
     for step in range(int(limit.max().ceil())):
         obs = env.step(policy(obs))[0]
         now = env.measure()
         running = ~success & ~fell & (step < limit)
+        postures.append((*stance.read(now), running))
         steps += running
         limb_steps += running & now.limb_contact
         fell |= running & now.fallen
         success |= running & ~now.fallen & (now.distance >= RADIUS)
         if step % 25 == 0 and not (~success & ~fell & (step < limit)).any():
             break
-    return Outcomes(success, success & (limb_steps <= LIMB_SHARE * steps), fell)
+    return Outcomes(
+        success=success,
+        strict=success & (limb_steps <= LIMB_SHARE * steps),
+        kept=success & _keeps(env, trials.skill, postures),
+        fell=fell,
+    )
+
+
+def _keeps(
+    env: SkillEnv, skill: torch.Tensor, postures: list[tuple[torch.Tensor, ...]]
+) -> torch.Tensor:
+    """Return who kept its keyframe, (N,) bool, from height, pitch and "running" of each step."""
+    height, pitch, running = (torch.stack(x) for x in zip(*postures, strict=True))
+    height_error, pitch_error = (
+        mean_where(error, running.float()) for error in posture_errors(height, pitch, skill, env)
+    )
+    return (height_error <= FLOOR["height"]) & (pitch_error <= FLOOR["pitch"])
 
 
 @dataclass(frozen=True)
@@ -115,9 +155,9 @@ class TerrainResult:
         return scalars
 
 
-def rough_types(terrains: Sequence[str]) -> list[int]:
-    """Return the indices of the terrain types that are not flat."""
-    return [index for index, name in enumerate(terrains) if name != "flat"]
+def rough_types(terrains: Sequence[str]) -> tuple[str, ...]:
+    """Return the terrain types that are not flat."""
+    return tuple(name for name in terrains if name != "flat")
 
 
 def evaluate_terrain(
@@ -130,29 +170,57 @@ def evaluate_terrain(
         policy: Observation -> mean actions.
         robots: Trials of each type and skill.
         level: Difficulty level.
-        speeds: Lowest and highest commanded v_x, spread evenly over the trials of a cell, m/s.
+        speeds: Lowest and highest commanded v_x, m/s.
     """
-    types, count = rough_types(env.terrains), len(env.skills)
-    terrain = torch.tensor(types, device=env.device).repeat_interleave(count * robots)
-    skill = torch.arange(count, device=env.device).repeat_interleave(robots).repeat(len(types))
+    types = rough_types(env.terrains)
+    outcomes = cross(env, policy, [Obstacle(name, level) for name in types], robots, speeds)
+    success, strict = (x.float().mean(dim=-1).cpu() for x in (outcomes.success, outcomes.strict))
+    return TerrainResult(types, env.skills, level, success, strict)
+
+
+def cross(
+    env: SkillEnv,
+    policy: Policy,
+    obstacles: Sequence[Obstacle],
+    robots: int,
+    speeds: tuple[float, float],
+    seed: int = SEED,
+) -> Outcomes:
+    """Try every skill on every obstacle, with any heading and speeds over the whole range.
+
+    Args:
+        env: Of K * S * robots worlds.
+        policy: Observation -> mean actions.
+        obstacles: K tiles.
+        robots: Trials of each obstacle and skill.
+        speeds: Lowest and highest commanded v_x, spread evenly over the trials of a cell, m/s.
+        seed: Of robots and headings.
+
+    Returns:
+        Outcomes of shape (K, S, robots).
+    """
+    outcomes = run_trials(env, policy, _deal(env, obstacles, robots, speeds), seed)
+    shape = (len(obstacles), len(env.skills), robots)
+    return Outcomes(**{name: flags.view(shape) for name, flags in vars(outcomes).items()})
+
+
+def _deal(
+    env: SkillEnv, obstacles: Sequence[Obstacle], robots: int, speeds: tuple[float, float]
+) -> Trials:
+    """Deal the worlds to obstacles, then skills, then speeds."""
+    count, cells = len(env.skills), len(obstacles)
+
+    def of_each(values: list[int]) -> torch.Tensor:
+        return torch.tensor(values, device=env.device).repeat_interleave(count * robots)
+
     # The middle of as many equal parts of the range as there are trials.
     parts = (torch.arange(robots, device=env.device) + 0.5) / robots
-    spread = speeds[0] + (speeds[1] - speeds[0]) * parts
-    trials = Trials(
-        terrain=terrain,
-        level=torch.full_like(terrain, level),
-        skill=skill,
-        speed=spread.repeat(len(types) * count),
-    )
-    outcomes = run_trials(env, policy, trials)
-
-    def shares(flags: torch.Tensor) -> torch.Tensor:
-        return flags.float().view(len(types), count, robots).mean(dim=-1).cpu()
-
-    return TerrainResult(
-        terrains=tuple(env.terrains[index] for index in types),
-        skills=env.skills,
-        level=level,
-        success=shares(outcomes.success),
-        strict=shares(outcomes.strict),
+    speed = speeds[0] + (speeds[1] - speeds[0]) * parts
+    variants = [o.variant for o in obstacles if o.variant is not None]
+    return Trials(
+        terrain=of_each([env.terrains.index(o.terrain) for o in obstacles]),
+        level=of_each([o.level for o in obstacles]),
+        skill=torch.arange(count, device=env.device).repeat_interleave(robots).repeat(cells),
+        speed=speed.repeat(count * cells),
+        variant=of_each(variants) if variants else None,
     )

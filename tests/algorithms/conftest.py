@@ -92,7 +92,7 @@ class CountingEnv(SkillEnv):
     def unused(self, *args):
         raise NotImplementedError
 
-    seed = reset = place = set_task = measure = foot_height_b = unused
+    seed = reset = place = set_task = measure = foot_pos_b = foot_height_b = unused
     describe = state_dict = load_state_dict = unused
 
 

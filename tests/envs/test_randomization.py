@@ -183,20 +183,22 @@ def test_the_feet_next_to_the_centre_of_mass_carry_more(build):
     assert share[1] - share[0] == pytest.approx(0.05 / 0.38 * 1.43 / MASS, abs=0.04)
 
 
-def test_slippery_feet_slide_further(build):
-    slid = []
-    for friction in ("[0.5,0.5]", "[1.25,1.25]"):
-        env = build(friction=friction)
-        stand(env, steps=20)
-        before = env.sim.qpos[:, 1].clone()
-        shove = env.sim.qvel.clone()
-        shove[:, 1] = 1.0
-        env.sim.write_velocity(torch.ones(8, dtype=torch.bool), shove)
-        actions = hold(env)
-        for _ in range(10):
-            env.step(actions)
-        slid.append((env.sim.qpos[:, 1] - before).mean().item())
-    assert slid[0] > 1.5 * slid[1]
+@pytest.mark.parametrize("friction", [0.1, 0.2])
+def test_a_pushed_robot_slides_as_far_as_its_friction_lets_it(build, friction):
+    env = build(friction=f"[{friction},{friction}]")
+    start(env, "crawl")
+    actions = hold(env)
+    for _ in range(20):
+        env.step(actions)
+    before, shove = env.sim.qpos[:, 0].clone(), env.sim.qvel.clone()
+    shove[:, 0] = 1.0
+    env.sim.write_velocity(torch.ones(8, dtype=torch.bool), shove)
+    for _ in range(60):
+        env.step(actions)
+    # Coulomb: v^2 / (2 mu g); the legs swallow a little of it
+    expected = 1.0 / (2 * friction * GRAVITY)
+    slid = (env.sim.qpos[:, 0] - before).mean().item()
+    assert slid == pytest.approx(expected, rel=0.12)
 
 
 def pushes(env, steps):

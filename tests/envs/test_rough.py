@@ -151,10 +151,10 @@ def test_flat_ground_knows_no_terrain(build_env):
 
 
 class Slide:
-    """A policy that cheats: the base slides along its command, on its knees where told to."""
+    """A policy that cheats: the base slides along its command, crouching where told to."""
 
-    def __init__(self, env, knees=()):
-        self.env, self.knees = env, list(knees)
+    def __init__(self, env, crouching=()):
+        self.env, self.crouching = env, list(crouching)
 
     def __call__(self, obs):
         env = self.env
@@ -166,8 +166,8 @@ class Slide:
         velocity[:, :2] = 0.0
         env.sim.write_state(torch.ones(env.num_envs, dtype=torch.bool), qpos, velocity, qpos[:, 7:])
         action = holding(env)
-        action[self.knees] = 0.0
-        action[self.knees, ::2] = 2.5  # thighs back: shanks on the ground
+        crawl = env.keyframe_joint_pos[[env.skills.index("crawl")]]
+        action[self.crouching] = env._postures.holding(crawl)
         return action
 
 
@@ -193,6 +193,15 @@ def test_who_gets_far_enough_in_time_succeeds(build, monkeypatch):
     assert outcomes.success.tolist() == 4 * [True] + 4 * [False]
     assert not outcomes.fell.any()
     assert torch.equal(outcomes.strict, outcomes.success)
+
+
+def test_who_crouches_succeeds_but_does_not_keep_its_keyframe(build):
+    env = build("env.terminations.episode_length=21")
+    flat = torch.full((8,), env.terrains.index("flat"))
+    trials = Trials(flat, torch.zeros_like(flat), torch.zeros_like(flat), torch.full((8,), 2.0))
+    outcomes = run_trials(env, Slide(env, crouching=(0, 1)), trials)
+    assert outcomes.success.all() and outcomes.strict[2:].all()
+    assert outcomes.kept.tolist() == 2 * [False] + 6 * [True]
 
 
 def test_shares_are_those_of_type_and_skill(build):

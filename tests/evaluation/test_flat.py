@@ -20,6 +20,7 @@ from kiras_rl.evaluation.flat import (
 
 DT, STEPS = 0.1, 30  # the first ten steps are the second that does not count
 KEYFRAMES = SimpleNamespace(
+    step_dt=DT,
     skills=("low", "high"),
     keyframe_height=torch.tensor([0.2, 0.3]),
     keyframe_pitch=torch.tensor([0.0, 0.1]),

@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+import csv
+import io
 import json
 import shutil
 
 import pytest
+from rich.console import Console
 
-from kiras_rl.tools import compare
+from kiras_rl.tools import compare, evaluate, train
+from kiras_rl.tools.curves import read_scalars
 from kiras_rl.tools.evaluate import main
 from kiras_rl.tools.policy_files import shipped_policy
+from kiras_rl.tools.protocols import PROTOCOLS
+from kiras_rl.tools.protocols.subject import Options, Subject
 
 SKILLS = ["walk", "crawl", "stilt", "pitch_up", "pitch_down"]
 FEW = ["--robots", "2", "--trials", "1", "--duration", "2"]
@@ -39,7 +45,11 @@ def test_the_imitation_protocol_measures_the_shipped_policy(tmp_path, capsys):
         assert 1.0 < result["power"] < 15.0
 
 
-def test_terrain_is_crossed_level_by_level_and_gives_the_same_numbers_again(tmp_path, capsys):
+def test_terrain_is_crossed_level_by_level_and_gives_the_same_numbers_again(
+    tmp_path, capsys, monkeypatch
+):
+    monkeypatch.setattr("kiras_rl.evaluation.terrain.RADIUS", 0.6)  # m
+    monkeypatch.setattr("kiras_rl.evaluation.terrain.TIME_LIMIT", 3.0)  # s
     command = ["--protocol", "terrain", "--levels", "0,1", "--trials", "1"]
     assert main([*command, "--out", str(tmp_path / "a")]) == 0
     assert "Level 0" in capsys.readouterr().out
@@ -58,7 +68,8 @@ def test_terrain_is_crossed_level_by_level_and_gives_the_same_numbers_again(tmp_
     assert again == {key: found[key] for key in again}
 
 
-def test_transitions_are_measured_on_both_grounds(tmp_path):
+def test_transitions_are_measured_on_both_grounds(tmp_path, monkeypatch):
+    monkeypatch.setattr(PROTOCOLS["transitions"], "HOLD", 1.5)  # s
     assert main(["--protocol", "transitions", "--trials", "1", "--out", str(tmp_path)]) == 0
     found = results(tmp_path, "transitions")
     assert len(found) == 3
@@ -66,8 +77,8 @@ def test_transitions_are_measured_on_both_grounds(tmp_path):
     assert flat["settled"][0][1] == 1.0 and flat["settled"][0][0] is None
     trace = next(value for key, value in found.items() if "/trace" in key)
     assert trace["order"] == [*SKILLS, "walk"]
-    assert trace["height"]["mean"][140] == pytest.approx(0.2, abs=0.02)  # of walking, at 2.8 s
-    assert trace["height"]["mean"][290] == pytest.approx(0.1, abs=0.02)  # of crawling
+    assert trace["height"]["mean"][70] == pytest.approx(0.2, abs=0.02)  # of walking, at 1.4 s
+    assert trace["height"]["mean"][145] == pytest.approx(0.1, abs=0.02)  # of crawling
 
 
 def test_policies_are_set_side_by_side_and_seeds_pooled(tmp_path, capsys, monkeypatch):
@@ -86,6 +97,57 @@ def test_policies_are_set_side_by_side_and_seeds_pooled(tmp_path, capsys, monkey
     assert (tmp_path / "ours/seed_1/evaluation/results.json").is_file()
     assert compare.main(["x=one.onnx", "x=one.onnx"]) == 2
     assert "two policies are called 'x'" in capsys.readouterr().err
+
+
+def test_skill_sampling_is_read_from_the_logs_of_all_seeds(tmp_path, smoke_run):
+    runs, other = tmp_path / "tiny", ["--cfg", "smoke", "seed=2", "evaluation.interval=0"]
+    shutil.copytree(smoke_run, runs / "seed_1")
+    assert train.main([*other, "--runs", str(tmp_path)]) == 0
+    (run,) = (tmp_path / "smoke").iterdir()
+    run.rename(runs / "seed_2")
+    command = [str(runs), "--protocol", "sampling", "--out", str(tmp_path / "page")]
+    assert compare.main(command) == 0
+    table = (tmp_path / "page/tables/sampling_probabilities.csv").read_text().splitlines()
+    assert len(table) == 1 + len(SKILLS)
+    for row, skill in zip(csv.reader(table[1:]), SKILLS, strict=True):
+        logs = [read_scalars(runs / f"seed_{k}")[f"Skill/probability_{skill}"] for k in (1, 2)]
+        assert row[:2] == ["tiny", skill]
+        assert [iterations for iterations, _ in logs] == 2 * [[1, 2, 3, 4]]
+        end_of_learning, end = (sum(values[i] for _, values in logs) / 2 for i in (1, 3))
+        assert [float(x) for x in row[4:]] == pytest.approx([100 * end_of_learning, 100 * end])
+
+
+def test_progress_moves_with_every_step(tmp_path):
+    options = Options(robots=1, duration=2.0, backend="native")
+    subject, shares = Subject.load(None, None, tmp_path, options), []
+    subject.progress.show = shares.append
+    PROTOCOLS["flat"].measure(subject)
+    # 100 steps of an episode that has a second to spare
+    assert shares == pytest.approx([step / 150 for step in range(1, 101)])
+
+
+def test_progress_counts_what_is_still_to_be_measured(tmp_path):
+    subject, shares = Subject.load(None, None, tmp_path, Options()), []
+    subject.progress.show = shares.append
+    subject.ledger.get("known", dict)
+
+    def half():
+        subject.progress.tell(0.5)
+        return {}
+
+    subject.results({"known": half, "first": half, "second": half})
+    assert shares == [0.25, 0.75]
+
+
+def test_a_terminal_shows_a_bar_and_a_file_a_line_a_protocol(tmp_path, capsys, monkeypatch):
+    command = ["--protocol", "flat", *FEW, "--out", str(tmp_path)]
+    screen = Console(file=io.StringIO(), force_terminal=True, width=120)
+    with monkeypatch.context() as patch:
+        patch.setattr(evaluate, "console", screen)
+        assert main(command) == 0
+    assert "flat (1 of 1): solo8/flat" in screen.file.getvalue()
+    assert main(command) == 0
+    assert capsys.readouterr().out.startswith("measuring flat (1 of 1)\n")
 
 
 @pytest.mark.parametrize("option", ["--robots", "--trials"])

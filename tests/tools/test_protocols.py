@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 
+from kiras_rl.tools.protocols import sampling
 from kiras_rl.tools.protocols.crossing import percent, pooled, wilson
 from kiras_rl.tools.protocols.pooling import pool
 
@@ -29,6 +30,25 @@ def test_counts_of_all_skills_add_up():
     }
     assert pooled(cells) == {"trials": 20, "success": 10, "strict": 5}
     assert percent(pooled(cells), "success") == "50 [30, 70]"
+
+
+def test_skill_sampling_shows_mean_and_range_of_the_seeds():
+    seeds = [
+        {"walk": [[1, 0.2], [2, 0.4], [4, 0.4]], "crawl": [[1, 0.8], [2, 0.6], [4, 0.6]]},
+        {"walk": [[1, 0.4], [2, 0.6], [3, 0.6]], "crawl": [[1, 0.6], [2, 0.4], [3, 0.4]]},
+    ]
+    section = sampling.section({"ours": {"first_phase": 2, "curves": seeds}})
+    (table,) = section.tables
+    # at 1/2 (before the first iteration), 3/2, 2 and the last iteration that both seeds have
+    assert table.rows[0] == ("ours", "walk", *(pytest.approx(x) for x in (30, 40, 50, 50)))
+    (axis,) = section.figures[0].drawing.axes
+    x, mean = axis.lines[0].get_data()
+    assert (x[0], x[-1]) == (1, 3)
+    assert (mean[0], mean[-1]) == (pytest.approx(0.3), pytest.approx(0.5))
+    band = axis.collections[0].get_paths()[0].vertices
+    assert (band[:, 1].min(), band[:, 1].max()) == (pytest.approx(0.2), pytest.approx(0.6))
+    phases = [(p.get_x(), p.get_x() + p.get_width()) for p in axis.patches]
+    assert phases == [(0, 2), (2, 3)]
 
 
 def test_seeds_are_averaged_counts_added_and_curves_kept():

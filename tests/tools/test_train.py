@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -31,11 +32,9 @@ def contents(folder):
 
 
 @pytest.fixture(scope="module")
-def smoke(tmp_path_factory):
-    """A finished run of cfg/smoke.yaml."""
-    runs = tmp_path_factory.mktemp("runs")
-    assert main(["--cfg", "smoke", "--runs", str(runs)]) == 0
-    return only_run(runs, "smoke")
+def smoke(smoke_run, tmp_path_factory):
+    """A finished run of cfg/smoke.yaml of one's own."""
+    return shutil.copytree(smoke_run, tmp_path_factory.mktemp("runs") / "smoke")
 
 
 def test_a_run_holds_all_that_was_promised(smoke):

@@ -3,7 +3,8 @@
 A protocol is a module with
 
 - TITLE and TEXT: a heading, and what is measured and how,
-- measure(subject) -> plain values, kept in the subject's ledger piece by piece,
+- measure(subject) -> plain values, measured piece by piece with `subject.results`, which keeps
+  them and shows the progress,
 - section(results): tables and figures of the values of one or several policies, by their label.
 """
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 from dataclasses import asdict
 
-from kiras_rl.evaluation.flat import SkillResult, evaluate_skills
-from kiras_rl.tools.evaluator import FLOOR, make_evaluation_env
+from kiras_rl.evaluation.flat import FLOOR, SkillResult, evaluate_skills
+from kiras_rl.tools.evaluator import make_evaluation_env
 from kiras_rl.tools.protocols.rows import skill_table
 from kiras_rl.tools.protocols.subject import Subject
 from kiras_rl.tools.report.content import Cell, Column, Section, Table
@@ -42,13 +42,13 @@ def measure(subject: Subject) -> dict:
     def run() -> dict:
         worlds = options.robots * len(subject.skills)
         env = make_evaluation_env(subject.flat(), worlds, options.duration, options.device)
-        results = evaluate_skills(env, subject.policy, options.duration, options.command)
+        results = evaluate_skills(env, subject.policy_in(env), options.duration, options.command)
         return {name: asdict(result) for name, result in results.items()}
 
     key = subject.key(
         "flat", robots=options.robots, duration=options.duration, command=options.command
     )
-    return {"skills": subject.ledger.get(key, run)}
+    return {"skills": subject.results({key: run})[key]}
 
 
 def section(results: dict[str, dict]) -> Section:

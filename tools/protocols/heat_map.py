@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
-from functools import cache
+import math
+from collections.abc import Callable, Iterator
+from functools import cache, partial
 
 import numpy as np
 
 from kiras_rl.envs.quadruped import QuadrupedEnv
+from kiras_rl.evaluation.flat import FLOOR
+from kiras_rl.evaluation.terrain import Obstacle
 from kiras_rl.tools.protocols import imitation
-from kiras_rl.tools.protocols.crossing import Obstacle, cross, percent, pooled, share
+from kiras_rl.tools.protocols.crossing import count, percent, pooled, share
 from kiras_rl.tools.protocols.pooling import pool
 from kiras_rl.tools.protocols.rows import panels
 from kiras_rl.tools.protocols.subject import Subject
@@ -19,7 +23,9 @@ TITLE = "Heat map: steps and discrete footholds"
 TEXT = (
     "As the protocol terrain, on steps (S) and discrete footholds (D), with many trials, and the "
     "cosine to the keyframe on flat ground (C) beside them. Headline: steps of 6 cm, gaps of 8 cm "
-    "(times the scale of the robot's terrain)."
+    "(times the scale of the robot's terrain). Kept: crossed in the skill's own keyframe, with "
+    "mean errors of height and pitch over the ground it stands on of at most "
+    f"{100 * FLOOR['height']:.0f} cm and {math.degrees(FLOOR['pitch']):.0f} degrees."
 )
 
 HEADLINE = {"S": Obstacle("stairs", 4), "D": Obstacle("footholds", 5)}
@@ -33,44 +39,41 @@ CHUNK = 200  # trials of a skill at a time: an interruption loses no more
 
 def measure(subject: Subject) -> dict:
     """Return the counts of each obstacle and skill, and the cosines."""
-
-    @cache
-    def build(trials: int) -> QuadrupedEnv:
-        return terrain_env(subject, trials)
-
-    def counts(obstacle: Obstacle, trials: int) -> dict:
-        parts = [min(CHUNK, trials - done) for done in range(0, trials, CHUNK)]
-        results = []
-        for index, part in enumerate(parts):
-            key = subject.key(
-                "heat_map", type=obstacle.terrain, level=obstacle.level, part=index, trials=part
-            )
-
-            def run(part: int = part, index: int = index) -> dict:
-                return cross(build(part), subject, [obstacle], part, index)[0]
-
-            results.append(subject.ledger.get(key, run))
-        return pool(results)
-
-    options = subject.options
+    build, trials = cache(partial(terrain_env, subject)), subject.options.trials_or
+    wanted = dict.fromkeys(HEADLINE.values(), trials(HEADLINE_TRIALS))
+    wanted |= dict.fromkeys(OTHERS, trials(OTHER_TRIALS))
+    parts = {o: dict(_parts(subject, build, o, number)) for o, number in wanted.items()}
+    pieces = {key: run for runs in parts.values() for key, run in runs.items()}
+    on_flat, run = imitation.piece(subject)
+    results = subject.results(pieces | {on_flat: run})
+    cells = {obstacle: pool([results[key] for key in keys]) for obstacle, keys in parts.items()}
     return {
         "terrain": _lengths(subject),
-        "headline": {
-            name: counts(obstacle, options.trials_or(HEADLINE_TRIALS))
-            for name, obstacle in HEADLINE.items()
-        },
-        "others": [
-            {
-                "type": obstacle.terrain,
-                "level": obstacle.level,
-                "cells": counts(obstacle, options.trials_or(OTHER_TRIALS)),
-            }
-            for obstacle in OTHERS
-        ],
-        "cosine": {
-            name: values["cosine"] for name, values in imitation.measure(subject)["skills"].items()
-        },
+        "headline": {name: cells[obstacle] for name, obstacle in HEADLINE.items()},
+        "others": [{"type": o.terrain, "level": o.level, "cells": cells[o]} for o in OTHERS],
+        "cosine": {name: values["cosine"] for name, values in results[on_flat]["skills"].items()},
     }
+
+
+def _parts(
+    subject: Subject, build: Callable[[int], QuadrupedEnv], obstacle: Obstacle, trials: int
+) -> Iterator[tuple[str, Callable[[], dict]]]:
+    """Yield the key of each CHUNK of trials, and what measures it."""
+
+    def run(number: int, index: int) -> dict:
+        return count(build(number), subject, [obstacle], number, index)[0]
+
+    for index, done in enumerate(range(0, trials, CHUNK)):
+        number = min(CHUNK, trials - done)
+        key = subject.key(
+            "heat_map",
+            type=obstacle.terrain,
+            level=obstacle.level,
+            part=index,
+            trials=number,
+            kept=f"{100 * FLOOR['height']:g}cm,{math.degrees(FLOOR['pitch']):g}deg",
+        )
+        yield key, partial(run, number, index)
 
 
 def _lengths(subject: Subject) -> dict[str, list[float]]:
@@ -87,7 +90,7 @@ def section(results: dict[str, dict]) -> Section:
     """Return the heat maps, the shares with their intervals, and the other levels."""
     tables = [_headline(name, results) for name in HEADLINE]
     tables += [_others(label, values) for label, values in results.items()]
-    figures = [_figure(kind, results) for kind in ("success", "strict")]
+    figures = [_figure(kind, results) for kind in ("success", "strict", "kept")]
     return Section("heat_map", TITLE, TEXT, tables, figures)
 
 
@@ -105,6 +108,7 @@ def _headline(name: str, results: dict[str, dict]) -> Table:
             label,
             percent(counts, "success"),
             percent(counts, "strict"),
+            percent(counts, "kept"),
             100 * share(counts, "fell"),
             counts["trials"],
         )
@@ -116,6 +120,7 @@ def _headline(name: str, results: dict[str, dict]) -> Table:
         Column("policy"),
         Column("success", "%"),
         Column("strict", "%"),
+        Column("kept", "%"),
         Column("falls", "%", "{:.0f}"),
         Column("trials", form="{}"),
     )
@@ -131,12 +136,12 @@ def _others(label: str, values: dict) -> Table:
     rows, skills = [], list(values["headline"]["S"])
     for cell in values["others"]:
         shares = [
-            f"{100 * share(c, 'success'):.0f} ({100 * share(c, 'strict'):.0f})"
+            " / ".join(f"{100 * share(c, kind):.0f}" for kind in ("success", "strict", "kept"))
             for c in _with_all(cell["cells"]).values()
         ]
         rows.append((_size(values, cell["type"], cell["level"]), *shares))
     columns = (Column("obstacle"), *map(Column, skills), Column("all"))
-    return Table(f"Other sizes: {label}", columns, rows, "Success in %, in brackets strict.")
+    return Table(f"Other sizes: {label}", columns, rows, "Success / strict / kept in %.")
 
 
 def _figure(kind: str, results: dict[str, dict]) -> Figure:

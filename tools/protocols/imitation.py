@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 from kiras_rl.evaluation.flat import SETTLE
 from kiras_rl.evaluation.imitation import STEPS, evaluate_imitation
@@ -57,6 +58,12 @@ GAIT = (
 
 def measure(subject: Subject) -> dict:
     """Return the results by skill and the confusion of keyframes."""
+    key, run = piece(subject)
+    return subject.results({key: run})[key]
+
+
+def piece(subject: Subject) -> tuple[str, Callable[[], dict]]:
+    """Return the key of the results, and what measures them."""
     options = subject.options
 
     def run() -> dict:
@@ -65,10 +72,10 @@ def measure(subject: Subject) -> dict:
         duration = SETTLE + STEPS * config.sim.timestep * config.sim.substeps
         worlds = options.robots * len(subject.skills)
         env = make_evaluation_env(config, worlds, duration, options.device)
-        return evaluate_imitation(env, subject.policy, options.command).as_dict()
+        return evaluate_imitation(env, subject.policy_in(env), options.command).as_dict()
 
     key = subject.key("imitation", robots=options.robots, command=options.command)
-    return subject.ledger.get(key, run)
+    return key, run
 
 
 def section(results: dict[str, dict]) -> Section:

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from functools import cache
+from functools import cache, partial
 
 from kiras_rl.envs.quadruped import QuadrupedEnv
-from kiras_rl.evaluation.terrain import TIME_LIMIT
+from kiras_rl.evaluation.terrain import TIME_LIMIT, Obstacle
 from kiras_rl.tools.evaluator import make_evaluation_env
-from kiras_rl.tools.protocols.crossing import Obstacle, cross, share
+from kiras_rl.tools.protocols.crossing import count, share
 from kiras_rl.tools.protocols.rows import colours, panels
 from kiras_rl.tools.protocols.subject import Subject
 from kiras_rl.tools.report.content import Column, Figure, Section, Table
@@ -51,18 +51,17 @@ def measure(subject: Subject) -> dict:
 
     def counts(course: str) -> dict:
         sizes, obstacles = zip(*COURSES[course], strict=True)
-        cells = cross(build(obstacles[0].terrain), subject, list(obstacles), trials)
+        cells = count(build(obstacles[0].terrain), subject, list(obstacles), trials)
         return dict(zip(map(str, sizes), cells, strict=True))
 
-    def key(course: str) -> str:
-        return subject.key("obstacles", course=course.replace(" ", "_"), trials=trials)
-
+    keys = {
+        course: subject.key("obstacles", course=course.replace(" ", "_"), trials=trials)
+        for course in COURSES
+    }
+    results = subject.results({key: partial(counts, course) for course, key in keys.items()})
     return {
         "scale": subject.rough().env.terrain.scale,
-        "courses": {
-            course: subject.ledger.get(key(course), lambda course=course: counts(course))
-            for course in COURSES
-        },
+        "courses": {course: results[key] for course, key in keys.items()},
     }
 
 

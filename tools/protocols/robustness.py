@@ -5,10 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 
-from kiras_rl.evaluation.flat import deal_skills, per_robot, record
+from kiras_rl.evaluation.flat import FLOOR, deal_skills, per_robot, record
 from kiras_rl.schema import Config, RandomizationConfig
-from kiras_rl.tools.evaluator import FLOOR, make_evaluation_env
+from kiras_rl.tools.evaluator import make_evaluation_env
 from kiras_rl.tools.protocols.rows import colours, panels
 from kiras_rl.tools.protocols.subject import Subject
 from kiras_rl.tools.report.content import Column, Figure, Section, Table
@@ -69,7 +70,11 @@ def sweeps(config: Config) -> list[Sweep]:
             setter("payload"),
         ),
         Sweep(
-            "friction", "", (1.25, 0.8, 0.5, 0.4, 0.3, 0.2, 0.1), drawn.friction, setter("friction")
+            "friction",
+            "",
+            (1.25, 0.8, 0.5, 0.2, 0.1, 0.05, 0.02),
+            drawn.friction,
+            setter("friction"),
         ),
         Sweep(
             "delay",
@@ -97,7 +102,8 @@ def measure(subject: Subject) -> dict:
         sweep.apply(config.env.randomization, value)
         worlds = options.robots * len(subject.skills)
         env = make_evaluation_env(config, worlds, DURATION, options.device)
-        recording = record(env, subject.policy, DURATION, *deal_skills(env, options.command))
+        tasks = deal_skills(env, options.command)
+        recording = record(env, subject.policy_in(env), DURATION, *tasks)
         robots = per_robot(recording, env)
         stands = robots["falls"] == 0
         keeps = stands.clone()
@@ -111,27 +117,27 @@ def measure(subject: Subject) -> dict:
             for i, skill in enumerate(subject.skills)
         }
 
-    config = replace(subject, options=replace(options, nominal=False)).flat()
-    result = {}
-    for sweep in sweeps(config):
-        cells = {}
-        for value in sweep.values:
-            key = subject.key(
-                "robustness",
-                of=sweep.name.replace(" ", "_"),
-                value=f"{value:g}",
-                robots=options.robots,
-                command=options.command,
-            )
-            cells[f"{value:g}"] = subject.ledger.get(
-                key, lambda sweep=sweep, value=value: run(sweep, value)
-            )
-        result[sweep.name] = {
+    def key(sweep: Sweep, value: float) -> str:
+        return subject.key(
+            "robustness",
+            of=sweep.name.replace(" ", "_"),
+            value=f"{value:g}",
+            robots=options.robots,
+            command=options.command,
+        )
+
+    disturbances = sweeps(replace(subject, options=replace(options, nominal=False)).flat())
+    results = subject.results(
+        {key(s, value): partial(run, s, value) for s in disturbances for value in s.values}
+    )
+    return {
+        sweep.name: {
             "unit": sweep.unit,
             "trained": list(sweep.trained),
-            "cells": cells,
+            "cells": {f"{value:g}": results[key(sweep, value)] for value in sweep.values},
         }
-    return result
+        for sweep in disturbances
+    }
 
 
 def section(results: dict[str, dict]) -> Section:

@@ -45,6 +45,11 @@ def measure(subject: Subject) -> dict:
     }
 
 
+def is_known(subject: Subject) -> bool:
+    """Return whether the policy lies in a run that did not draw its skills uniformly."""
+    return run_of(subject.source) is not None and subject.run.learner.skill_init is not None
+
+
 def run_of(source: Path) -> Path | None:
     """Return the run folder of a policy file, None where it lies in none."""
     for folder in (source.parent, source.parent.parent):
@@ -68,30 +73,11 @@ def _read(run: Path, names: list[str]) -> dict[str, list[tuple[int, float]]]:
 def section(results: dict[str, dict]) -> Section:
     """Return the curves, and the probabilities at the ends of the phases."""
     skills = list(next(iter(results.values()))["curves"][0])
-    drawing, axes = panels(len(results), width=4.4, height=3.0)
-    rows = []
-    for axis, (label, values) in zip(axes, results.items(), strict=True):
-        last = max(curve[skills[0]][-1][0] for curve in values["curves"])
-        grid = np.linspace(1, last, POINTS)
-        for skill, colour in zip(skills, colours(), strict=False):
-            seeds = np.stack(
-                [np.interp(grid, *zip(*curve[skill], strict=True)) for curve in values["curves"]]
-            )
-            axis.fill_between(
-                grid, seeds.min(0), seeds.max(0), color=colour, alpha=0.2, linewidth=0
-            )
-            axis.plot(grid, seeds.mean(0), color=colour, linewidth=1.2, label=skill)
-            at = {
-                share: float(np.interp(share * values["first_phase"], grid, seeds.mean(0)))
-                for share in (0.25, 0.75, 1.0)
-            }
-            rows.append((label, skill, *(100 * x for x in at.values()), 100 * seeds.mean(0)[-1]))
-        axis.axhline(1 / len(skills), color="k", linestyle=":", linewidth=0.8)
-        if last > values["first_phase"]:
-            axis.axvspan(values["first_phase"], last, color="#d1662a", alpha=0.08, linewidth=0)
-        axis.set(title=label, xlabel="iteration")
-    axes[0].set_ylabel("probability")
-    axes[-1].legend(fontsize=7)
+    rows = [
+        (label, skill, *_shares(values, skill))
+        for label, values in results.items()
+        for skill in skills
+    ]
     columns = (
         Column("policy"),
         Column("skill"),
@@ -100,6 +86,48 @@ def section(results: dict[str, dict]) -> Section:
         Column("at its end", "%", "{:.0f}"),
         Column("at the end", "%", "{:.0f}"),
     )
-    note = "Dotted: uniform; shaded: terrain finetuning."
-    table = Table("Probabilities", columns, rows)
-    return Section("sampling", TITLE, TEXT, [table], [Figure("Probabilities", drawing, note)])
+    table = Table("Probabilities", columns, rows, "Means over the seeds.")
+    return Section("sampling", TITLE, TEXT, [table], [_figure(results, skills)])
+
+
+def _ends(values: dict) -> tuple[float, float]:
+    """Return the first and last iteration of all seeds: one that still trains ends the curves."""
+    curves = [next(iter(curve.values())) for curve in values["curves"]]
+    return max(c[0][0] for c in curves), min(c[-1][0] for c in curves)
+
+
+def _seeds(values: dict, skill: str, iterations: np.ndarray) -> np.ndarray:
+    """Return the probabilities of a skill at iterations (n,), (seeds, n)."""
+    curves = [np.array(curve[skill]).T for curve in values["curves"]]
+    return np.stack([np.interp(iterations, x, y) for x, y in curves])
+
+
+def _shares(values: dict, skill: str) -> list[float]:
+    """Return the mean probabilities at the times of the table, %."""
+    at = [share * values["first_phase"] for share in (0.25, 0.75, 1.0)]
+    return (100 * _seeds(values, skill, np.array([*at, _ends(values)[1]])).mean(axis=0)).tolist()
+
+
+def _figure(results: dict[str, dict], skills: list[str]) -> Figure:
+    drawing, axes = panels(len(results), width=4.4, height=3.0)
+    for axis, (label, values) in zip(axes, results.items(), strict=True):
+        begin, end = _ends(values)
+        grid = np.linspace(begin, end, POINTS)
+        for skill, colour in zip(skills, colours(), strict=False):
+            seeds = _seeds(values, skill, grid)
+            low, high = seeds.min(axis=0), seeds.max(axis=0)
+            axis.fill_between(grid, low, high, color=colour, alpha=0.2, linewidth=0)
+            axis.plot(grid, seeds.mean(axis=0), color=colour, linewidth=1.2, label=skill)
+        axis.axhline(1 / len(skills), color="k", linestyle=":", linewidth=0.8)
+        change = min(values["first_phase"], end)
+        for span, colour in (((0, change), "#1f5fa8"), ((change, end), "#d1662a")):
+            if span[1] > span[0]:
+                axis.axvspan(*span, color=colour, alpha=0.06, linewidth=0)
+        axis.set(title=label, xlabel="iteration")
+    axes[0].set_ylabel("probability")
+    axes[-1].legend(fontsize=7)
+    note = (
+        "Mean and range of the seeds; dotted: uniform; shaded: skill learning (blue), terrain "
+        "finetuning (orange)."
+    )
+    return Figure("Probabilities", drawing, note)

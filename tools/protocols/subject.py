@@ -4,12 +4,19 @@ from __future__ import annotations
 
 import copy
 import hashlib
+import itertools
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
+from typing import Any
+
+import torch
+from tensordict import TensorDict
 
 from kiras_rl.config import list_configs, load_config
 from kiras_rl.deploy.policy import OnboardPolicy
+from kiras_rl.envs.quadruped import QuadrupedEnv
 from kiras_rl.evaluation.flat import Policy
 from kiras_rl.phases import FINETUNING, SKILL_LEARNING, phase_config
 from kiras_rl.schema import Config
@@ -47,6 +54,25 @@ class Options:
         return default if self.trials is None else self.trials
 
 
+@dataclass
+class Progress:
+    """How much of a protocol is measured.
+
+    Attributes:
+        show: Called with that share, 0 to 1, whenever it grows.
+        pieces: What there is to measure.
+        done: How many of the pieces are.
+    """
+
+    show: Callable[[float], object] = lambda share: None
+    pieces: int = 1
+    done: int = 0
+
+    def tell(self, share: float) -> None:
+        """Show that a share of the piece at hand is measured, 0 to 1."""
+        self.show((self.done + min(share, 1.0)) / self.pieces)
+
+
 @dataclass(frozen=True)
 class Subject:
     """A policy to measure.
@@ -57,6 +83,7 @@ class Subject:
         onboard: The policy as the robot runs it.
         folder: Where its results are kept.
         options: What the user changed.
+        progress: Of the protocol at hand.
     """
 
     label: str
@@ -64,6 +91,7 @@ class Subject:
     onboard: OnboardPolicy
     folder: Path
     options: Options = field(default_factory=Options)
+    progress: Progress = field(default_factory=Progress)
 
     @classmethod
     def load(
@@ -91,10 +119,30 @@ class Subject:
         """Names of the skills."""
         return tuple(self.onboard.metadata.skills)
 
-    @cached_property
-    def policy(self) -> Policy:
-        """Observation -> mean actions."""
-        return onboard_policy(self.onboard)
+    def policy_in(self, env: QuadrupedEnv) -> Policy:
+        """Return observation -> mean actions; every step in the environment is progress."""
+        policy, steps = onboard_policy(self.onboard), itertools.count(1)
+
+        def act(obs: TensorDict) -> torch.Tensor:
+            self.progress.tell(next(steps) / env.max_episode_length)
+            return policy(obs)
+
+        return act
+
+    def results(self, pieces: dict[str, Callable[[], dict | list]]) -> dict[str, Any]:
+        """Return the results by key; what the ledger lacks is measured, and kept piece by piece.
+
+        Args:
+            pieces: Key -> what measures it; see `Ledger.get`.
+        """
+        self.progress.pieces = max(1, sum(key not in self.ledger for key in pieces))
+        self.progress.done = 0
+        results = {}
+        for key, measure in pieces.items():
+            missing = key not in self.ledger
+            results[key] = self.ledger.get(key, measure)
+            self.progress.done += missing
+        return results
 
     @cached_property
     def ledger(self) -> Ledger:

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from functools import cache
+from functools import cache, partial
 
 from kiras_rl.envs.quadruped import QuadrupedEnv
-from kiras_rl.evaluation.terrain import TIME_LIMIT, TerrainResult
+from kiras_rl.evaluation.terrain import TIME_LIMIT, Obstacle, TerrainResult, rough_types
 from kiras_rl.tools.evaluator import make_evaluation_env
-from kiras_rl.tools.protocols.crossing import Obstacle, cross, pooled, share
+from kiras_rl.tools.protocols.crossing import count, pooled, share
 from kiras_rl.tools.protocols.rows import colours, panels
 from kiras_rl.tools.protocols.subject import Subject
 from kiras_rl.tools.report.content import Column, Figure, Section, Table
@@ -36,17 +36,11 @@ def measure(subject: Subject) -> dict:
 
     def level(number: int) -> dict:
         obstacles = [Obstacle(name, number) for name in names]
-        return dict(zip(names, cross(build(), subject, obstacles, trials), strict=True))
+        return dict(zip(names, count(build(), subject, obstacles, trials), strict=True))
 
-    def key(number: int) -> str:
-        return subject.key("terrain", level=number, trials=trials)
-
-    return {
-        "levels": {
-            str(number): subject.ledger.get(key(number), lambda number=number: level(number))
-            for number in options.levels
-        }
-    }
+    keys = {n: subject.key("terrain", level=n, trials=trials) for n in options.levels}
+    results = subject.results({key: partial(level, number) for number, key in keys.items()})
+    return {"levels": {str(number): results[key] for number, key in keys.items()}}
 
 
 def terrain_env(subject: Subject, trials: int) -> QuadrupedEnv:
@@ -60,7 +54,7 @@ def terrain_env(subject: Subject, trials: int) -> QuadrupedEnv:
 def rough_names(subject: Subject) -> list[str]:
     """Return the terrain types of a policy that are not flat."""
     types = subject.rough().env.terrain.types
-    return [name for name, values in types.items() if values is not None and name != "flat"]
+    return list(rough_types([name for name, values in types.items() if values is not None]))
 
 
 def section(results: dict[str, dict]) -> Section:

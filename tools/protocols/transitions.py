@@ -7,7 +7,7 @@ from dataclasses import asdict
 
 import torch
 
-from kiras_rl.evaluation.transitions import evaluate_transitions, trace_skills
+from kiras_rl.evaluation.transitions import AFTER, BEFORE, evaluate_transitions, trace_skills
 from kiras_rl.schema import Config
 from kiras_rl.tools.evaluator import make_evaluation_env
 from kiras_rl.tools.protocols.rows import colours, panels, scaled
@@ -57,14 +57,14 @@ def measure(subject: Subject) -> dict:
     keep = {"trials": trials, "command": options.command}
 
     def pairs(config: Config, rough: bool) -> dict:
-        count = len(subject.skills)
-        env = make_evaluation_env(config, count * (count - 1) * trials, 10.0, options.device)
+        worlds = len(subject.skills) * (len(subject.skills) - 1) * trials
+        env = make_evaluation_env(config, worlds, BEFORE + AFTER, options.device)
         if rough:
             kinds = [i for i, name in enumerate(env.terrains) if name != "flat"]
             kind = torch.tensor(kinds, device=env.device).repeat(env.num_envs // len(kinds) + 1)
             kind = kind[: env.num_envs]
             env.place(kind, torch.full_like(kind, ROUGH_LEVEL))
-        result = asdict(evaluate_transitions(env, subject.policy, trials, options.command))
+        result = asdict(evaluate_transitions(env, subject.policy_in(env), trials, options.command))
         return {
             name: [[_plain(x) for x in row] for row in value.tolist()]
             for name, value in result.items()
@@ -74,7 +74,7 @@ def measure(subject: Subject) -> dict:
     def trace() -> dict:
         order = [*range(len(subject.skills)), 0]
         env = make_evaluation_env(subject.flat(), TRACE_ROBOTS, HOLD * len(order), options.device)
-        height, pitch = trace_skills(env, subject.policy, order, HOLD, options.command)
+        height, pitch = trace_skills(env, subject.policy_in(env), order, HOLD, options.command)
         curves = {
             name: {
                 "mean": x.mean(1).tolist(),
@@ -92,13 +92,13 @@ def measure(subject: Subject) -> dict:
             **curves,
         }
 
-    get, key = subject.ledger.get, subject.key
-    return {
-        "skills": list(subject.skills),
-        "flat": get(key("transitions/flat", **keep), lambda: pairs(subject.flat(), rough=False)),
-        "rough": get(key("transitions/rough", **keep), lambda: pairs(subject.rough(), rough=True)),
-        "trace": get(key("transitions/trace", command=options.command), trace),
+    pieces = {
+        subject.key("transitions/flat", **keep): lambda: pairs(subject.flat(), rough=False),
+        subject.key("transitions/rough", **keep): lambda: pairs(subject.rough(), rough=True),
+        subject.key("transitions/trace", command=options.command): trace,
     }
+    results = zip(("flat", "rough", "trace"), subject.results(pieces).values(), strict=True)
+    return {"skills": list(subject.skills), **dict(results)}
 
 
 def section(results: dict[str, dict]) -> Section:

@@ -50,6 +50,10 @@ class Ledger:
             )
         return content
 
+    def __contains__(self, key: str) -> bool:
+        """Return whether there is a result of a key."""
+        return key in self.content["results"]
+
     def get(self, key: str, measure: Callable[[], dict | list]) -> dict | list:
         """Return the result of a key; measure and keep it where there is none yet.
 
