@@ -15,7 +15,7 @@ from kiras_rl.tools.evaluate import (
     measure,
     options_of,
 )
-from kiras_rl.tools.protocols import PROTOCOLS, sampling
+from kiras_rl.tools.protocols import PROTOCOLS, known
 from kiras_rl.tools.protocols.pooling import pool
 from kiras_rl.tools.protocols.subject import Options, Subject
 from kiras_rl.tools.report.about import about_table
@@ -96,9 +96,7 @@ def compare(methods: dict[str, list[Subject]], names: list[str] | None, out: Pat
     subjects = [subject for group in methods.values() for subject in group]
     if names is None:
         wanted = {name for subject in subjects for name in default_protocols(subject)}
-        if not all(map(sampling.is_known, subjects)):
-            wanted -= {"sampling"}
-        names = [name for name in PROTOCOLS if name in wanted]
+        names = known(wanted, subjects)
     sections: list[Section] = []
     page = out
     for name, values in measure(subjects, names):

@@ -14,7 +14,7 @@ from kiras_rl.checkpoint import CheckpointError
 from kiras_rl.config import ConfigError
 from kiras_rl.deploy.metadata import PolicyError
 from kiras_rl.robots.robot import RobotError
-from kiras_rl.tools.protocols import PROTOCOLS, sampling
+from kiras_rl.tools.protocols import PROTOCOLS, known
 from kiras_rl.tools.protocols.subject import Options, Subject
 from kiras_rl.tools.protocols.terrain import LEVELS
 from kiras_rl.tools.report.about import about_table
@@ -31,8 +31,8 @@ Tables are printed; a folder gets report.html, which opens offline, tables/*.csv
 That folder is evaluation/ of a run, or evaluation/<policy>/. An interrupted evaluation goes on
 where it was when the same command is given again.
 
-Without --protocol: flat, imitation, transitions, for a run sampling, and for a policy that was
-finetuned terrain.
+Without --protocol: flat, imitation, transitions, for a run sampling and learning, and for a policy
+that was finetuned terrain.
 
 """
 
@@ -60,9 +60,7 @@ def main(argv: list[str] | None = None) -> int:
     def work() -> None:
         subject = Subject.load(args.policy, args.robot, args.out, options_of(args))
         names = args.protocol or default_protocols(subject)
-        if names == ALL and not sampling.is_known(subject):
-            names = [name for name in names if name != "sampling"]
-        evaluate(subject, names)
+        evaluate(subject, known(names, [subject]) if names == ALL else names)
 
     return exit_code(work)
 
@@ -132,10 +130,10 @@ def _bar() -> Progress:
 
 def default_protocols(subject: Subject) -> list[str]:
     """Return what is measured of a policy where the user names nothing."""
-    names = ["flat", "imitation", "transitions"]
+    names = ["flat", "imitation", "transitions", "sampling", "learning"]
     if subject.is_finetuned:
         names.append("terrain")
-    return names + (["sampling"] if sampling.is_known(subject) else [])
+    return known(names, [subject])
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:

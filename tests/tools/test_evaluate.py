@@ -10,6 +10,7 @@ import shutil
 import pytest
 from rich.console import Console
 
+from kiras_rl.config import load_config
 from kiras_rl.tools import compare, evaluate, train
 from kiras_rl.tools.curves import read_scalars
 from kiras_rl.tools.evaluate import main
@@ -115,6 +116,23 @@ def test_skill_sampling_is_read_from_the_logs_of_all_seeds(tmp_path, smoke_run):
         assert [iterations for iterations, _ in logs] == 2 * [[1, 2, 3, 4]]
         end_of_learning, end = (sum(values[i] for _, values in logs) / 2 for i in (1, 3))
         assert [float(x) for x in row[4:]] == pytest.approx([100 * end_of_learning, 100 * end])
+
+
+def test_learning_is_read_from_the_log_of_a_run(tmp_path, smoke_run):
+    run = tmp_path / "run"
+    shutil.copytree(smoke_run, run)
+    assert main([str(run), "--protocol", "learning", "--out", str(tmp_path / "page")]) == 0
+    log, config = read_scalars(run), load_config("smoke")
+    (curves,) = PROTOCOLS["learning"].measure(Subject.load(run, None, None, Options()))["curves"]
+    iterations = [i for i in log["Eval_walk/height"][0] if i <= config.iterations]
+    steps = config.num_envs * config.learner.ppo.num_steps
+    assert curves["steps"] == [i * steps / 1e6 for i in iterations]
+    seconds = sum(steps / v for v in log["Perf/steps_per_second"][1][: iterations[-1]])
+    assert curves["minutes"][-1] == pytest.approx(seconds / 60)
+    errors = [log[f"Eval_{skill}/height_error"][1][0] for skill in SKILLS]
+    assert curves["height_error"][0] == pytest.approx(100 * sum(errors) / len(SKILLS))
+    (row,) = csv.DictReader((tmp_path / "page/tables").glob("learning*").__next__().open())
+    assert row["all skills first at the floor [M steps]"] == ""  # four iterations teach nothing
 
 
 def test_progress_moves_with_every_step(tmp_path):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from kiras_rl.tools.protocols import sampling
+from kiras_rl.tools.protocols import learning, sampling
 from kiras_rl.tools.protocols.crossing import percent, pooled, wilson
 from kiras_rl.tools.protocols.pooling import pool
 
@@ -49,6 +49,27 @@ def test_skill_sampling_shows_mean_and_range_of_the_seeds():
     assert (band[:, 1].min(), band[:, 1].max()) == (pytest.approx(0.2), pytest.approx(0.6))
     phases = [(p.get_x(), p.get_x() + p.get_width()) for p in axis.patches]
     assert phases == [(0, 2), (2, 3)]
+
+
+def test_learning_tells_when_every_seed_had_all_skills():
+    def seed(at_floor, ends=(2.0, 0.1)):
+        steps = [1.0, 2.0, 3.0]
+        errors = {"height_error": [9.0, 9.0, ends[0]], "velocity_error": [0.9, 0.9, ends[1]]}
+        minutes = [2.0 * x for x in steps]
+        return {"steps": steps, "minutes": minutes, "at_floor": at_floor} | errors
+
+    section = learning.section(
+        {
+            "ours": {"skills": 5, "curves": [seed([1, 5, 5]), seed([0, 2, 5], (4.0, 0.3))]},
+            "theirs": {"skills": 5, "curves": [seed([0, 5, 4]), seed([0, 2, 4])]},
+        }
+    )
+    ours, theirs = section.tables[0].rows
+    assert ours == ("ours", 2, 2.5, 5.0, 5.0, 3.0, pytest.approx(0.2))
+    assert theirs == ("theirs", 2, None, None, 4.0, 2.0, pytest.approx(0.1))
+    for figure, last in zip(section.figures, (3.0, 6.0), strict=True):
+        x, y = figure.drawing.axes[0].lines[0].get_data()
+        assert (x[-1], y[0], y[-1]) == (last, 0.5, 5.0)
 
 
 def test_seeds_are_averaged_counts_added_and_curves_kept():
