@@ -202,18 +202,17 @@ class KirasRunner(OnPolicyRunner):
                 self.alg.process_env_step(obs, rewards, dones, extras)
                 for key, value in extras["log"].items():
                     totals[key] = totals[key] + value if key in totals else value
-        # Once a rollout: every check waits for the device. NaN in an earlier step is still
-        # there, in the history of observations or in the stored rewards.
+        self.alg.compute_returns(obs)
+        # Once a rollout: every check waits for the device. NaN in an earlier step is still there,
+        # in the history of observations or in rewards, which hold values of time-outs.
         self._check_finite(obs)
-        with torch.no_grad():
-            self.alg.compute_returns(obs)
         sums = (*COUNTS, "Perf/")
         return {k: v if k.startswith(sums) else v / num_steps for k, v in totals.items()}
 
     def _check_finite(self, obs: TensorDict) -> None:
         fault = ""
         try:
-            check_nan(obs, self.alg.storage.task_rewards, self.alg.storage.dones)
+            check_nan(obs, self.alg.storage.rewards, self.alg.storage.dones)
         except ValueError as error:
             fault = str(error)
         if distributed.any_rank(bool(fault)):

@@ -127,6 +127,7 @@ class KirasPPO(PPO):
         self.storage.add_transition(step)
         step.clear()
 
+    @torch.no_grad()
     def compute_returns(self, obs: TensorDict) -> None:
         """Judge the rollout: values, imitation rewards, returns and one mixed advantage.
 

@@ -131,7 +131,8 @@ def test_learning_is_read_from_the_log_of_a_run(tmp_path, smoke_run):
     assert curves["minutes"][-1] == pytest.approx(seconds / 60)
     errors = [log[f"Eval_{skill}/height_error"][1][0] for skill in SKILLS]
     assert curves["height_error"][0] == pytest.approx(100 * sum(errors) / len(SKILLS))
-    (row,) = csv.DictReader((tmp_path / "page/tables").glob("learning*").__next__().open())
+    (table,) = (tmp_path / "page/tables").glob("learning*")
+    (row,) = csv.DictReader(table.read_text().splitlines())
     assert row["all skills first at the floor [M steps]"] == ""  # four iterations teach nothing
 
 
