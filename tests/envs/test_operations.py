@@ -13,7 +13,7 @@ from kiras_rl.config import load_config
 from kiras_rl.envs import make_env
 from kiras_rl.phases import FINETUNING, SKILL_LEARNING, phase_config
 
-LIMITS = {SKILL_LEARNING: 365, FINETUNING: 675}
+LIMITS = {SKILL_LEARNING: 385, FINETUNING: 750}
 """Operations of a step at most: those of today, and a few for terms to come."""
 
 CONSTANTS = 7  # operations by which masked worlds get new constants: on a CPU only if there are any

@@ -6,6 +6,7 @@ import json
 import sys
 import time
 from itertools import pairwise
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -160,7 +161,9 @@ def test_a_finer_time_step_is_nearer_to_the_reference(bench, tmp_path):
     assert "* configuration" in (tmp_path / "tables.txt").read_text()
 
 
-def test_options_need_a_policy_that_comes_with_the_robot(capsys):
+def test_options_need_a_policy_that_comes_with_the_robot(capsys, monkeypatch, tmp_path):
+    bare = SimpleNamespace(folder=tmp_path)
+    monkeypatch.setattr("kiras_rl.tools.policy_files.load_robot", lambda name: bare)
     assert main([*SMALL, "--parts=options", "--cfg=go1"]) == 2
     assert "no policy comes with go1" in capsys.readouterr().err
 

@@ -52,13 +52,17 @@ def test_shipped_policies_come_first_then_runs_the_newest_first(tmp_path, run, s
     write(run, "latest.pt", 1)
     shutil.copy(still_file, older / "policy.onnx")
     titles = [choice.title for choice in list_choices(tmp_path / "runs")]
-    assert titles[0] == "solo8: flat"
+    assert titles[:3] == ["go1: flat", "solo8: flat", "solo8: rough"]
     assert titles[-2:] == ["solo8/2026-01-02_10-00-00", "quick/2026-01-01_10-00-00"]
 
 
-def test_robots_without_a_policy_are_not_offered(tmp_path):
-    assert not [c for c in list_choices(tmp_path) if c.title.startswith("go1")]
-    assert all(choice.path.is_file() for choice in list_choices(tmp_path))
+def test_robots_without_a_policy_are_not_offered(tmp_path, monkeypatch, still_file):
+    for robot in ("bare", "able"):
+        (tmp_path / robot / "policies").mkdir(parents=True)
+    shutil.copy(still_file, tmp_path / "able/policies/still.onnx")
+    monkeypatch.setattr("kiras_rl.tools.viewer.choices.ROBOTS", tmp_path)
+    monkeypatch.setattr("kiras_rl.tools.viewer.choices.list_robots", lambda: ["able", "bare"])
+    assert [choice.title for choice in list_choices(tmp_path / "runs")] == ["able: still"]
 
 
 def test_a_choice_is_called_by_robot_file_or_run(run, still_file):
