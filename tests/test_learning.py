@@ -59,10 +59,12 @@ def test_the_estimator_learns_the_velocity(logged):
     assert logged("Estimator/velocity", -10, None) < 0.6 * logged("Estimator/velocity", 0, 3)
 
 
-def test_the_critics_foresee_the_returns(logged):
+def test_the_critics_foresee_the_returns(trained, logged):
     for group in ("task", "imitation"):
         value, future = (logged(f"Critic/{group}_{x}", -5, None) for x in ("value", "return"))
-        assert value == pytest.approx(future, rel=0.1)
+        # returns may pass through zero: the error is compared with how far they have changed
+        returns = [scalars[f"Critic/{group}_return"] for scalars in trained[1]]
+        assert value == pytest.approx(future, abs=0.1 * (max(returns) - min(returns)))
 
 
 def test_skills_part(trained):
