@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from kiras_rl.config import ConfigError
+from kiras_rl.tools.curves import read_scalars
 from kiras_rl.tools.protocols.rows import colours, panels
 from kiras_rl.tools.protocols.subject import Subject
 from kiras_rl.tools.report.content import Column, Figure, Section, Table
@@ -32,16 +33,16 @@ def measure(subject: Subject) -> dict:
         raise ConfigError(
             f"sampling: {subject.source} lies in no run folder; name the run that trained it"
         )
-    skills = [f"Skill/probability_{name}" for name in subject.skills]
-    curves = _read(run, skills)
-    if not all(curves.values()):
+    log = read_scalars(run)
+    tags = {name: f"Skill/probability_{name}" for name in subject.skills}
+    if not all(tag in log for tag in tags.values()):
         raise ConfigError(
             f"sampling: the log of {run} holds no skill probabilities (learner.skill_init=null "
             "draws skills uniformly)"
         )
     return {
         "first_phase": subject.run.iterations,
-        "curves": [{name.removeprefix("Skill/probability_"): c for name, c in curves.items()}],
+        "curves": [{name: list(zip(*log[tag], strict=True)) for name, tag in tags.items()}],
     }
 
 
@@ -56,18 +57,6 @@ def run_of(source: Path) -> Path | None:
         if (folder / "config.yaml").is_file() and any(folder.glob("events.*")):
             return folder
     return None
-
-
-def _read(run: Path, names: list[str]) -> dict[str, list[tuple[int, float]]]:
-    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-
-    log = EventAccumulator(str(run), size_guidance={"scalars": 0})
-    log.Reload()
-    known = set(log.Tags()["scalars"])
-    return {
-        name: [(e.step, e.value) for e in log.Scalars(name)] if name in known else []
-        for name in names
-    }
 
 
 def section(results: dict[str, dict]) -> Section:
