@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from dataclasses import replace
 
 import torch
 from tensordict import TensorDict
@@ -28,6 +29,7 @@ from kiras_rl.envs.state import Keyframes, RobotState, Step, Task
 from kiras_rl.envs.terrain_library import build_library
 from kiras_rl.envs.terrains import CROSSED
 from kiras_rl.interfaces import Measurements, SkillEnv
+from kiras_rl.recorded import Recorded, copied
 from kiras_rl.robots.robot import Robot
 from kiras_rl.schema import EnvConfig, SimConfig
 
@@ -86,6 +88,7 @@ class QuadrupedEnv(SkillEnv):
         self._held = False  # tasks set from outside stay until set again
         self._length = index.clone()
         self._action = torch.zeros(n, self.num_actions, device=device)
+        self._last_action = self._action.clone()
         self._last_joint_vel = torch.zeros(n, self.num_actions, device=device)
         self._last_joint_torque = torch.zeros(n, self.num_actions, device=device)
         self._air_time = torch.zeros(n, len(robot.foot_geoms), device=device)
@@ -122,6 +125,25 @@ class QuadrupedEnv(SkillEnv):
             )
         self._is_flat = self._curriculum.is_flat if self._curriculum else self._all
         self._placed: torch.Tensor | None = None  # tiles chosen from outside, (N,)
+        self._advance = Recorded(
+            self._judge_and_begin,
+            self.device,
+            carried=self._carried,
+            renewed=(self.robot, self._observer),
+            variant=lambda: (self._held, self._placed is None),
+        )
+
+    def _carried(self) -> list[tuple[object, str]]:
+        """Return the attributes that a step reads and replaces; see `Recorded`."""
+        names = [*_BUFFERS, "_last_action", *(f"task.{name}" for name in vars(self.task))]
+        slots: list[tuple[object, str]] = [(self, name) for name in names]
+        slots += [(self._tasks, "probabilities")]
+        slots += [(self._observer, name) for name in ("clean", "features", "_frame", "_history")]
+        if self._curriculum:
+            slots += [(self._curriculum, name) for name in self._curriculum.state_dict()]
+        if self._placed is not None:
+            slots += [(self, "_placed")]
+        return slots
 
     def _begin(self) -> None:
         self.reset()
@@ -149,17 +171,21 @@ class QuadrupedEnv(SkillEnv):
             observations: Groups of kiras_rl.interfaces, new tensors.
             rewards: Task reward, unclipped, (N,).
             dones: Episodes that ended, (N,) bool.
-            extras: The EXTRA_* tensors of kiras_rl.interfaces, NEXT_PROPRIO and `log`.
+            extras: What kiras_rl.interfaces names EXTRA_*, NEXT_PROPRIO and `log`.
         """
-        last_action = self._action
-        self._action = actions.clamp(-self.cfg.action_clip, self.cfg.action_clip)
+        clip = self.cfg.action_clip
+        self._last_action, self._action = self._action, actions.clamp(-clip, clip)
         begin = time.perf_counter()
         self.sim.step(self._postures.joint_targets(self._action))
-        self._physics_time = time.perf_counter() - begin
+        physics_time = time.perf_counter() - begin
+        self._random.refill()
+        obs, rewards, dones, extras = self._advance()
+        return obs, rewards, dones, extras | {names.EXTRA_PHYSICS_TIME: physics_time}
+
+    def _judge_and_begin(self) -> tuple[TensorDict, torch.Tensor, torch.Tensor, dict]:
+        """Do all of a step that follows the physics."""
         self._length = self._length + 1
         self.robot.read_step()
-        self._random.refill()
-
         invalid = self.sim.diverged | self.sim.overflowed
         fallen = invalid | terminations.fallen(
             self.robot, self.task, self.keyframes, self.cfg.terminations
@@ -167,7 +193,7 @@ class QuadrupedEnv(SkillEnv):
         distance = self._distance()
         crossed = (distance > CROSSED) & (self._ground is not None)  # flat ground has no end
         time_outs = ((self._length >= self.max_episode_length) | crossed) & ~fallen
-        terms = self._judge(last_action, fallen, invalid)
+        terms = self._judge(fallen, invalid)
         observer, view = self._observer, self._view()
         extras = {
             names.EXTRA_TIME_OUTS: time_outs,
@@ -190,9 +216,7 @@ class QuadrupedEnv(SkillEnv):
         """Return how far bases are from the middle of their tile, max(|x|, |y|), (N,), m."""
         return self.robot.base_pos_w[:, :2].abs().amax(dim=1)
 
-    def _judge(
-        self, last_action: torch.Tensor, fallen: torch.Tensor, invalid: torch.Tensor
-    ) -> torch.Tensor:
+    def _judge(self, fallen: torch.Tensor, invalid: torch.Tensor) -> torch.Tensor:
         """Return the weighted reward terms, (N, terms).
 
         A world whose physics broke has no meaningful terms; it earns nothing but the termination.
@@ -202,7 +226,7 @@ class QuadrupedEnv(SkillEnv):
             task=self.task,
             keyframes=self.keyframes,
             action=self._action,
-            last_action=last_action,
+            last_action=self._last_action,
             last_joint_vel=self._last_joint_vel,
             last_joint_torque=self._last_joint_torque,
             air_time=self._air_time,
@@ -273,14 +297,13 @@ class QuadrupedEnv(SkillEnv):
         events = torch.stack([fallen, time_outs, self.sim.diverged, self.sim.overflowed], dim=1)
         counts = events.sum(dim=0, dtype=torch.float32).unbind()
         log |= zip(_EVENTS, counts, strict=True)
-        log["Perf/physics_time"] = torch.tensor(self._physics_time)
         return log | (self._curriculum.describe(self.skills) if self._curriculum else {})
 
     # --- the rest of SkillEnv -----------------------------------------------------------------
 
     def get_observations(self) -> TensorDict:
         """Return the observation of the last step or reset."""
-        return self._observer.observation
+        return copied(self._observer.observation)
 
     @property
     def episode_length_buf(self) -> torch.Tensor:
@@ -332,7 +355,7 @@ class QuadrupedEnv(SkillEnv):
         """Give every world a new skill and command, which stay until the next call."""
         self._held = True
         self.task = Task.of(command, skill, self.task.start)
-        return self._observer.change_task(self._view())
+        return copied(self._observer.change_task(self._view()))
 
     def set_skill_probabilities(self, probabilities: torch.Tensor) -> None:
         """Set the probabilities with which new skills are drawn, (S,)."""
@@ -340,7 +363,7 @@ class QuadrupedEnv(SkillEnv):
 
     def measure(self) -> Measurements:
         """Return the measurements of the last step, before its resets."""
-        return self._measurements
+        return replace(self._measurements, **copied(vars(self._measurements)))
 
     def foot_pos_b(self, joint_pos: torch.Tensor) -> torch.Tensor:
         """Return the centres of the feet in the base frame, (N, F, 3), m."""
@@ -362,9 +385,8 @@ class QuadrupedEnv(SkillEnv):
 
     def state_dict(self) -> dict:
         """Return all that the next steps depend on, for an exact resume."""
-        return {
-            "sim": self.sim.state_dict(),
-            "task": vars(self.task).copy(),
+        state = {
+            "task": vars(self.task),
             "held": self._held,
             "probabilities": self._tasks.probabilities,
             "generator": self._random.generator.get_state(),
@@ -373,6 +395,7 @@ class QuadrupedEnv(SkillEnv):
             "curriculum": self._curriculum.state_dict() if self._curriculum else {},
             "tile": self._ground.tile if self._ground else None,
         }
+        return copied(state) | {"sim": self.sim.state_dict()}
 
     def load_state_dict(self, state: dict) -> None:
         """Go on from a saved state of the same number of worlds."""

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import copy
+
+import mujoco
+import numpy as np
 import torch
+from torch.quasirandom import SobolEngine
 
 from kiras_rl.envs.model import Scene
 from kiras_rl.envs.randomness import UniformBuffer, scale_to
-from kiras_rl.envs.simulation.base import Simulation
+from kiras_rl.envs.simulation.base import BODY_FIELDS, Simulation
 from kiras_rl.schema import RandomizationConfig
 
 COLUMNS = {
     "friction": 1,
-    "payload": 1,
-    "com_shift": 3,
+    "body": 1,
     "kp_factor": 1,
     "kd_factor": 1,
     "action_delay": 1,
@@ -21,6 +25,8 @@ COLUMNS = {
     "torque_factor": 1,
 }
 """Random numbers that this module takes each step."""
+
+BODIES = 512  # bases of different mass and centre of mass among which worlds draw
 
 
 class Randomizer:
@@ -41,7 +47,10 @@ class Randomizer:
         slides = torch.zeros(model.ngeom, 3, dtype=torch.bool)
         slides[scene.robot_geoms, 0] = True
         self._slides = slides.to(sim.device)
-        self._mass, self._com = nominal("body_mass"), nominal("body_ipos")
+        self._bodies = None
+        if config.payload or config.com_shift:
+            fields = draw_bodies(scene, config.payload, config.com_shift)
+            self._bodies = {name: values.to(sim.device) for name, values in fields.items()}
         self._gain, self._bias = nominal("actuator_gainprm"), nominal("actuator_biasprm")
         self._delay = nominal("actuator_delay")
         self._limits = nominal("actuator_forcerange")
@@ -51,8 +60,10 @@ class Randomizer:
         config = self._config
         if config.friction:
             self._write_friction(mask, self._draw("friction", config.friction))
-        if config.payload or config.com_shift:
-            self._write_base(mask)
+        if self._bodies:
+            number = scale_to(self._random["body"][:, 0], 0.0, BODIES).long()
+            for name, values in self._bodies.items():
+                self._sim.write_field(name, mask, values[number])
         if config.kp_factor or config.kd_factor:
             self._write_gains(mask)
         if config.torque_factor:
@@ -76,17 +87,6 @@ class Randomizer:
         values = torch.where(self._slides, friction[..., None], self._friction)
         self._sim.write_field("geom_friction", mask, values)
 
-    def _write_base(self, mask: torch.Tensor) -> None:
-        mass, com = self._mass.clone(), self._com.clone()
-        base, config = self._scene.base_body, self._config
-        if config.payload:
-            mass[:, base].add_(scale_to(self._random["payload"][:, 0], *config.payload))
-        if config.com_shift:
-            com[:, base].add_(scale_to(self._random["com_shift"], *config.com_shift))
-        self._sim.write_field("body_mass", mask, mass)
-        self._sim.write_field("body_ipos", mask, com)
-        self._sim.set_const(mask)
-
     def _write_gains(self, mask: torch.Tensor) -> None:
         """Scale a position actuator: gain kp, bias (0, -kp, -kd)."""
         gain, bias = self._gain.clone(), self._bias.clone()
@@ -107,3 +107,40 @@ class Randomizer:
         # float32 time has lost its last digits after 16 s.
         seconds = (steps - 0.5).clamp(min=0.0) * self._scene.model.opt.timestep
         self._sim.write_field("actuator_delay", mask, seconds.expand_as(self._delay))
+
+
+def draw_bodies(
+    scene: Scene,
+    payload: tuple[float, float] | None,
+    com_shift: tuple[float, float] | None,
+    count: int = BODIES,
+) -> dict[str, torch.Tensor]:
+    """Return BODY_FIELDS of robots whose base carries a payload and has its centre of mass moved.
+
+    What follows from a mass is computed here, by MuJoCo, and once: at a reset a world only copies
+    it. Payload and shifts fill their box evenly (Sobol), the same in every run.
+
+    Args:
+        scene: Its model is nominal.
+        payload: Range of the mass that is added, kg.
+        com_shift: Range of the shift along each axis of the base, m.
+        count: How many.
+
+    Returns:
+        Name -> values, (count, *shape of the field in MjModel).
+    """
+    model, base = copy.copy(scene.model), scene.base_body
+    data = mujoco.MjData(model)
+    uniform = SobolEngine(4, scramble=True, seed=1).draw(count, dtype=torch.float64)
+    masses = scale_to(uniform[:, 0], *(payload or (0.0, 0.0))) + model.body_mass[base]
+    shift = scale_to(uniform[:, 1:], *(com_shift or (0.0, 0.0))).numpy()
+    centres = model.body_ipos[base] + shift
+    fields = {
+        name: np.empty((count, *getattr(model, name).shape), np.float32) for name in BODY_FIELDS
+    }
+    for k, mass in enumerate(masses.tolist()):
+        model.body_mass[base], model.body_ipos[base] = mass, centres[k]
+        mujoco.mj_setConst(model, data)
+        for name, values in fields.items():
+            values[k] = getattr(model, name)
+    return {name: torch.from_numpy(values) for name, values in fields.items()}

@@ -59,6 +59,10 @@ EXTRA_FLAT = "is_flat"
 """Worlds whose ground is flat, (N,) bool."""
 
 
+EXTRA_PHYSICS_TIME = "physics_time"
+"""How long the physics backend kept the host, s, a number."""
+
+
 @dataclass(frozen=True)
 class Measurements:
     """What an evaluation reads after a step, before automatic resets; shapes (N,) if not given.

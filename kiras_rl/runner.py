@@ -16,6 +16,7 @@ from tensordict import TensorDict
 from torch.utils.tensorboard import SummaryWriter
 
 from kiras_rl import __version__, checkpoint, distributed
+from kiras_rl import interfaces as names
 from kiras_rl.algorithms.kiras import KirasPPO
 from kiras_rl.config import config_to_dict
 from kiras_rl.deploy.metadata import FORMAT as METADATA_FORMAT
@@ -162,10 +163,9 @@ class KirasRunner(OnPolicyRunner):
         self.current_learning_iteration += 1
         steps = self.env.num_envs * self.cfg["num_steps_per_env"] * distributed.size()
         self.steps += steps
-        physics = log.pop("Perf/physics_time")
-        scalars |= {key: value.item() for key, value in log.items()} | {
-            "Perf/physics_time": physics.item(),
-            "Perf/environment_time": self._env_time - physics.item(),
+        scalars |= log | {
+            "Perf/physics_time": self._physics_time,
+            "Perf/environment_time": self._env_time - self._physics_time,
             "Perf/inference_time": collected - begin - self._env_time,
             "Perf/learning_time": learned - collected,
             "Perf/steps_per_second": steps / (learned - begin),
@@ -186,11 +186,12 @@ class KirasRunner(OnPolicyRunner):
             terrain=self.terrain,
         )
 
-    def _rollout(self) -> dict[str, torch.Tensor]:
+    def _rollout(self) -> dict[str, float]:
         """Collect one rollout; return the environment's log, averaged over its steps."""
-        totals: dict[str, torch.Tensor] = {}
+        log: dict[str, torch.Tensor] = {}
+        totals = torch.zeros((), device=self.device)
         num_steps = self.cfg["num_steps_per_env"]
-        self._env_time = 0.0
+        self._env_time = self._physics_time = 0.0
         obs = self.env.get_observations()
         # no_grad, not inference_mode: what is recorded here is trained on, and edited, later
         with torch.no_grad(), single_threaded(self.device):
@@ -200,14 +201,15 @@ class KirasRunner(OnPolicyRunner):
                 obs, rewards, dones, extras = self.env.step(actions)
                 self._env_time += time.perf_counter() - begin
                 self.alg.process_env_step(obs, rewards, dones, extras)
-                for key, value in extras["log"].items():
-                    totals[key] = totals[key] + value if key in totals else value
+                self._physics_time += extras[names.EXTRA_PHYSICS_TIME]
+                log = extras["log"]  # the same names in every step
+                totals = totals + torch.stack(tuple(log.values())) if log else totals
         self.alg.compute_returns(obs)
         # Once a rollout: every check waits for the device. NaN in an earlier step is still there,
         # in the history of observations or in rewards, which hold values of time-outs.
         self._check_finite(obs)
-        sums = (*COUNTS, "Perf/")
-        return {k: v if k.startswith(sums) else v / num_steps for k, v in totals.items()}
+        values = zip(log, totals.tolist(), strict=True) if log else ()
+        return {k: v if k.startswith(COUNTS) else v / num_steps for k, v in values}
 
     def _check_finite(self, obs: TensorDict) -> None:
         fault = ""

@@ -6,6 +6,7 @@ import os
 
 import pytest
 import torch
+from tape import Tape
 
 torch.set_num_threads(2)  # what CI has: the same order of sums, hence the same bits, on any machine
 
@@ -28,6 +29,13 @@ def seeded():
 def pytest_runtest_setup(item):
     if item.get_closest_marker("gpu") and not torch.cuda.is_available():
         pytest.skip("needs CUDA")
+
+
+@pytest.fixture
+def taped(monkeypatch):
+    """Let a CPU record what a GPU would: torch.cuda's graphs are stand-ins."""
+    monkeypatch.setattr(torch.cuda, "CUDAGraph", Tape)
+    monkeypatch.setattr(torch.cuda, "graph", lambda tape: tape)
 
 
 @pytest.fixture(scope="session")

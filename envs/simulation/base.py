@@ -13,10 +13,12 @@ from typing import Protocol
 import mujoco
 import torch
 
+BODY_FIELDS = ("body_mass", "body_ipos", "body_subtreemass", "body_invweight0", "dof_invweight0")
+"""Masses, centres of mass, and the constants that follow from them (mj_setConst)."""
+
 RANDOMISED_FIELDS = (
+    *BODY_FIELDS,
     "geom_friction",
-    "body_mass",
-    "body_ipos",
     "actuator_gainprm",
     "actuator_biasprm",
     "actuator_delay",
@@ -84,17 +86,13 @@ class Simulation(Protocol):
         ...
 
     def write_field(self, name: str, mask: torch.Tensor, values: torch.Tensor) -> None:
-        """Set one of RANDOMISED_FIELDS in the masked worlds.
+        """Set one of RANDOMISED_FIELDS in the masked worlds; those of BODY_FIELDS belong together.
 
         Args:
             name: Field of MjModel.
             mask: Worlds to write, (N,) bool.
             values: New values, (N, *shape of the field in MjModel).
         """
-        ...
-
-    def set_const(self, mask: torch.Tensor) -> None:
-        """Recompute the constants that depend on masses in the masked worlds."""
         ...
 
     def write_terrain(self, mask: torch.Tensor, tile: torch.Tensor) -> None:

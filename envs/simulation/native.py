@@ -58,7 +58,6 @@ class NativeSimulation:
         self._bind_state()
         self._allocate_outputs()
         self._bind_terrain(terrain)
-        self._batch.set_const()  # so that the constants, too, hold one value a world
 
     def _bind_state(self) -> None:
         batch = self._batch
@@ -145,12 +144,6 @@ class NativeSimulation:
         ids = mask.nonzero().squeeze(1)
         self._fields[name][ids.numpy()] = values[ids].numpy()
 
-    def set_const(self, mask: torch.Tensor) -> None:
-        """Recompute the constants that depend on masses in the masked worlds."""
-        ids = mask.nonzero().squeeze(1)
-        if len(ids):
-            self._batch.set_const(ids.numpy())
-
     def write_terrain(self, mask: torch.Tensor, tile: torch.Tensor) -> None:
         """Show a tile in the masked worlds."""
         rows = mask.nonzero().squeeze(1).numpy()
@@ -166,10 +159,11 @@ class NativeSimulation:
 
     def load_state_dict(self, state: dict[str, torch.Tensor]) -> None:
         """Go on from a saved state."""
-        for name, field in self._fields.items():
-            field[:] = state[f"field/{name}"].numpy()
         self._tile[:] = state["tile"].numpy()
-        self._show_tiles(slice(None))
-        self._batch.set_const()
+        if self._terrain is not None:
+            self._show_tiles(slice(None))
+            self._batch.set_const()
+        for name, field in self._fields.items():  # last: set_const would round them otherwise
+            field[:] = state[f"field/{name}"].numpy()
         self._batch.state[:] = state["state"].numpy()
         self._read_state()

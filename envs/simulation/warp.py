@@ -24,11 +24,6 @@ from kiras_rl.envs.terrain_geoms import TERRAIN_FIELDS, TerrainGeoms
 _log = logging.getLogger(__name__)
 wp.config.log_level = wp.LOG_WARNING  # else a line on standard output for each of 70 modules
 
-_CONSTANTS = ("body_subtreemass", "body_invweight0", "dof_invweight0")
-"""Fields that follow from masses: `set_const` gives each world its own."""
-
-_CONSTANT_GROUPS = mjw.SetConstGroup.FIXED | mjw.SetConstGroup.INERT0
-
 # Everything that loses contacts or constraints; the two others only end the solver early.
 _OVERFLOW = int(
     mjw.OverflowType.ALL & ~(mjw.OverflowType.ITERATIONS | mjw.OverflowType.LS_ITERATIONS)
@@ -100,7 +95,7 @@ class WarpSimulation:
         terrain: TerrainGeoms | None,
     ) -> None:
         n = self.num_worlds
-        fields = RANDOMISED_FIELDS + _CONSTANTS + (TERRAIN_FIELDS if terrain else ())
+        fields = RANDOMISED_FIELDS + (TERRAIN_FIELDS if terrain else ())
         sizes = dict.fromkeys(fields, n)
         self._m = mjw.put_model(self.model, batch_sizes=sizes)
         self._m.opt.warn_overflow = 0  # printed by the kernels; counted here instead
@@ -123,7 +118,6 @@ class WarpSimulation:
         self.diverged = torch.zeros_like(self.overflowed)
         self._monitor = OverflowMonitor(_BUDGETS, self.num_worlds, self.device)
         self._fields = {name: wp.to_torch(getattr(self._m, name)) for name in RANDOMISED_FIELDS}
-        self._constants = {name: wp.to_torch(getattr(self._m, name)) for name in _CONSTANTS}
         self._state = {
             "qpos": self.qpos,
             "qvel": self.qvel,
@@ -132,7 +126,6 @@ class WarpSimulation:
             "qacc_warmstart": self._warmstart,
         }
         self._state |= {f"field/{name}": x for name, x in self._fields.items()}
-        self._state |= {f"constant/{name}": x for name, x in self._constants.items()}
         self._bind_history()
 
     def _bind_history(self) -> None:
@@ -174,9 +167,7 @@ class WarpSimulation:
             capture = False
         _log.info("Preparing the kernels of MuJoCo-Warp: minutes the first time, seconds later")
         initial = self.state_dict()
-        record = functools.partial(_Launches, device=self._warp_device, capture=capture)
-        self._control_step = record(self._launch_control_step)
-        self._set_const = record(lambda: mjw.set_const(self._m, self._d, _CONSTANT_GROUPS))
+        self._control_step = _Launches(self._launch_control_step, self._warp_device, capture)
         self.load_state_dict(initial)
         self.sensor_record.zero_()
 
@@ -221,17 +212,6 @@ class WarpSimulation:
     def write_field(self, name: str, mask: torch.Tensor, values: torch.Tensor) -> None:
         """Set one of RANDOMISED_FIELDS in the masked worlds."""
         _write(self._fields[name], mask, values)
-
-    def set_const(self, mask: torch.Tensor) -> None:
-        """Recompute the constants that depend on masses in the masked worlds."""
-        # On CUDA the question would cost a wait.
-        if self.device.type == "cpu" and not mask.numpy().any():
-            return
-        before = {name: x.clone() for name, x in self._constants.items()}
-        self._set_const()  # of every world
-        others = ~mask
-        for name, x in self._constants.items():
-            _write(x, others, before[name])
 
     def write_terrain(self, mask: torch.Tensor, tile: torch.Tensor) -> None:
         """Show a tile in the masked worlds."""

@@ -8,11 +8,13 @@ from tensordict import TensorDict
 from kiras_rl import distributed
 from kiras_rl import interfaces as names
 from kiras_rl.algorithms.adaboot import MODES, AdaBoot
+from kiras_rl.algorithms.adam import load_adam, make_adam
 from kiras_rl.algorithms.losses import gaussian_kl, masked_mse
 from kiras_rl.algorithms.storage import GroupRolloutStorage, mini_batches
 from kiras_rl.config import ConfigError
 from kiras_rl.interfaces import SkillEnv
 from kiras_rl.models.estimator import VELOCITY_DIM, ContextEstimator
+from kiras_rl.recorded import Recorded
 from kiras_rl.schema import EstimatorConfig
 
 VELOCITY_SCALE = 2.0  # in the loss: velocity errors then weigh as much as observation errors
@@ -39,8 +41,12 @@ class Estimation:
             )
         self.config = config
         self.estimator = estimator.to(device)
-        self.optimizer = torch.optim.Adam(
-            self.estimator.parameters(), lr=config.learning_rate, fused=True
+        self._device = device
+        self.optimizer = make_adam(self.estimator.parameters(), config.learning_rate, device)
+        self._data: dict[str, torch.Tensor] = {}
+        self._num_mini_batches = 1
+        self._epoch = Recorded(
+            self._train_epoch, device, variant=lambda: self._num_mini_batches, communicates=True
         )
         self.adaboot = AdaBoot(config.adaboot, config.adaboot_floor, num_envs, device)
 
@@ -93,27 +99,35 @@ class Estimation:
 
     def _train(self, storage: GroupRolloutStorage, num_mini_batches: int) -> dict[str, float]:
         obs = storage.observations
-        data = storage.shuffled(
+        storage.shuffle_into(
+            self._data,
             history=obs[names.HISTORY],
             velocity=obs[names.VELOCITY],
             target=obs[names.NEXT_PROPRIO],
             skill=obs[names.SKILL],
             goes_on=storage.dones == 0,
         )
-        totals = torch.zeros(4, device=storage.device)
-        for batch in mini_batches(data, num_mini_batches, self.config.epochs):
-            parts = self._losses(**batch)
-            velocity, prediction, kl, prior = parts
-            loss = velocity * VELOCITY_SCALE**2 + prediction
-            loss = loss + self.config.kl_weight * kl + self.config.prior_weight * prior
-            self.optimizer.zero_grad()
-            loss.backward()
-            distributed.average_gradients(self.estimator.parameters())
-            self.optimizer.step()
-            totals += torch.stack(parts).detach()
+        self._num_mini_batches = num_mini_batches
+        totals = sum(self._epoch() for _ in range(self.config.epochs))
         means = (totals / (num_mini_batches * self.config.epochs)).tolist()
         tags = ("velocity", "prediction", "kl", "prior")
         return {f"Estimator/{tag}": value for tag, value in zip(tags, means, strict=True)}
+
+    def _train_epoch(self) -> torch.Tensor:
+        """Take a gradient step on every mini-batch; return the sums of `_losses`, (4,)."""
+        batches = mini_batches(self._data, self._num_mini_batches)
+        return torch.stack([self._train_step(batch) for batch in batches]).sum(0)
+
+    def _train_step(self, batch: dict[str, torch.Tensor]) -> torch.Tensor:
+        parts = self._losses(**batch)
+        velocity, prediction, kl, prior = parts
+        loss = velocity * VELOCITY_SCALE**2 + prediction
+        loss = loss + self.config.kl_weight * kl + self.config.prior_weight * prior
+        self.optimizer.zero_grad()
+        loss.backward()
+        distributed.average_gradients(self.estimator.parameters())
+        self.optimizer.step()
+        return torch.stack(parts).detach()
 
     def _losses(
         self,
@@ -147,5 +161,6 @@ class Estimation:
     def load_state_dict(self, state: dict) -> None:
         """Go on from a saved state."""
         self.estimator.load_state_dict(state["estimator"])
-        self.optimizer.load_state_dict(state["optimizer"])
+        load_adam(self.optimizer, state["optimizer"], self._device)
+        self._epoch.forget()
         self.adaboot.load_state_dict(state["adaboot"])

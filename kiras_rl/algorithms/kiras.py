@@ -15,6 +15,7 @@ from kiras_rl import distributed
 from kiras_rl import interfaces as names
 from kiras_rl.algorithms import losses, returns
 from kiras_rl.algorithms.adaboot import AdaBoot
+from kiras_rl.algorithms.adam import fit_adam, make_adam
 from kiras_rl.algorithms.estimation import Estimation
 from kiras_rl.algorithms.parts import Parts, build_parts
 from kiras_rl.algorithms.residual import Reference
@@ -24,6 +25,7 @@ from kiras_rl.imitation.self_imitation import SelfImitation
 from kiras_rl.interfaces import SkillEnv
 from kiras_rl.models.critics import GroupCritic
 from kiras_rl.models.exported import ExportedPolicy
+from kiras_rl.recorded import Recorded
 from kiras_rl.schedules import advantage_weights, piecewise_linear
 from kiras_rl.schema import LearnerConfig
 
@@ -60,8 +62,11 @@ class KirasPPO(PPO):
         )
         # On the device, as the KL divergence that it follows: no step of the update waits for it
         self.learning_rate = torch.tensor(ppo.learning_rate, device=device)
+        self.desired_kl = torch.zeros((), device=device)
         parameters = chain(parts.actor.parameters(), parts.critic.parameters())
-        self.optimizer = torch.optim.Adam(parameters, lr=self.learning_rate, fused=True)
+        self.optimizer = make_adam(parameters, self.learning_rate, device)
+        self._data: dict[str, torch.Tensor] = {}
+        self._epoch = Recorded(self._train_epoch, device, communicates=True)
         self.config = config
         self.iterations = iterations
         self.iteration = 0
@@ -195,10 +200,8 @@ class KirasPPO(PPO):
         }
         if self.reference:
             tensors |= {key: st.observations[key] for key in (names.FLAT_ACTION, names.IS_FLAT)}
-        data = st.shuffled(**tensors)
-        totals = torch.zeros(3, device=self.device)
-        for batch in mini_batches(data, self.num_mini_batches, self.num_learning_epochs):
-            totals += self._policy_step(batch)
+        st.shuffle_into(self._data, **tensors)
+        totals = sum(self._epoch() for _ in range(self.num_learning_epochs))
         surrogate, value, kl = (
             totals / (self.num_mini_batches * self.num_learning_epochs)
         ).tolist()
@@ -209,6 +212,12 @@ class KirasPPO(PPO):
             "Policy/learning_rate": self.learning_rate.item(),
             "Policy/action_std": self.actor.output_std.mean().item(),
         }
+
+    def _train_epoch(self) -> torch.Tensor:
+        """Take a gradient step on every mini-batch; return the sums of (surrogate, value, KL)."""
+        return torch.stack(
+            [self._policy_step(batch) for batch in mini_batches(self._data, self.num_mini_batches)]
+        ).sum(0)
 
     def _policy_step(self, batch: dict[str, torch.Tensor]) -> torch.Tensor:
         """Take one gradient step; return (surrogate, value, KL), (3,)."""
@@ -249,7 +258,7 @@ class KirasPPO(PPO):
         """Set action noise and step size of the next iteration."""
         std = piecewise_linear(self.config.ppo.action_std, self.progress)
         self.actor.distribution.std_param.fill_(std)
-        self.desired_kl = piecewise_linear(self.config.ppo.desired_kl, self.progress)
+        self.desired_kl.fill_(piecewise_linear(self.config.ppo.desired_kl, self.progress))
 
     # --- skills ---------------------------------------------------------------------------------
 
@@ -343,11 +352,13 @@ class KirasPPO(PPO):
 
     def load(self, loaded_dict: dict, load_cfg: dict | None = None, strict: bool = True) -> bool:
         """Load what `save` returned."""
+        rate = self.learning_rate  # loading replaces it by a copy
         super().load(loaded_dict, load_cfg, strict)
+        self.learning_rate = rate
+        fit_adam(self.optimizer, [rate], self.device)
+        self._epoch.forget()
         self.iteration = loaded_dict["iteration"]
         self.learning_rate.fill_(loaded_dict["learning_rate"])
-        for group in self.optimizer.param_groups:  # loading has replaced it by a copy
-            group["lr"] = self.learning_rate
         for name, part in self._parts().items():
             part.load_state_dict(loaded_dict[name])
         if self.sampler:

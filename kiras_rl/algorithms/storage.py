@@ -61,21 +61,22 @@ class GroupRolloutStorage(RolloutStorage):
             stored[step] = new
         self.step += 1
 
-    def shuffled(self, **tensors: torch.Tensor) -> dict[str, torch.Tensor]:
-        """Flatten (T, N, ...) tensors and put them in one random order, (T * N, ...)."""
+    def shuffle_into(self, data: dict[str, torch.Tensor], **tensors: torch.Tensor) -> None:
+        """Write (T, N, ...) tensors into `data`, flat and in one random order, (T * N, ...).
+
+        The tensors of `data` are made at the first call and stay the same from then on.
+        """
         count = self.num_transitions_per_env * self.num_envs
         order = torch.randperm(count, device=self.device)
-        return {name: tensor.flatten(0, 1)[order] for name, tensor in tensors.items()}
+        for name, tensor in tensors.items():
+            rows = tensor.flatten(0, 1)
+            if name not in data:
+                data[name] = torch.empty_like(rows)
+            torch.index_select(rows, 0, order, out=data[name])
 
 
-def mini_batches(
-    data: dict[str, torch.Tensor], count: int, epochs: int
-) -> Iterator[dict[str, torch.Tensor]]:
-    """Yield `count` slices of shuffled data, `epochs` times over.
-
-    The order is drawn once: slices of a tensor shuffled once are views, and cost nothing.
-    """
+def mini_batches(data: dict[str, torch.Tensor], count: int) -> Iterator[dict[str, torch.Tensor]]:
+    """Yield `count` slices of shuffled data; they are views, and cost nothing."""
     size = len(next(iter(data.values()))) // count
-    for _ in range(epochs):
-        for i in range(count):
-            yield {name: x[i * size : (i + 1) * size] for name, x in data.items()}
+    for i in range(count):
+        yield {name: x[i * size : (i + 1) * size] for name, x in data.items()}

@@ -7,11 +7,13 @@ from tensordict import TensorDict
 
 from kiras_rl import distributed
 from kiras_rl import interfaces as names
+from kiras_rl.algorithms.adam import load_adam, make_adam
 from kiras_rl.algorithms.losses import discriminator_loss, gradient_penalty
 from kiras_rl.algorithms.storage import GroupRolloutStorage
 from kiras_rl.imitation.premium import PremiumSelector
 from kiras_rl.interfaces import SkillEnv
 from kiras_rl.models.discriminator import Discriminator, imitation_reward
+from kiras_rl.recorded import Recorded
 from kiras_rl.schedules import piecewise_linear
 from kiras_rl.schema import ImitationConfig
 
@@ -45,16 +47,24 @@ class SelfImitation:
         features = keyframe_features.shape[1]
         self.config = config
         self._skills = skills
+        self._device = device
         self._noise = feature_noise.repeat(2)
+        self._noise_factor = torch.ones((), device=device)
         self.discriminator = Discriminator(features, config.discriminator.hidden_dims).to(device)
-        self.optimizer = torch.optim.Adam(
-            self.discriminator.parameters(), lr=config.discriminator.learning_rate, fused=True
-        )
+        rate = config.discriminator.learning_rate
+        self.optimizer = make_adam(self.discriminator.parameters(), rate, device)
         self.selector = PremiumSelector(config.premium, keyframe_features, num_envs, num_steps)
         self._pairs = torch.zeros(num_steps, num_envs, 2 * features, device=device)
         self._valid = torch.zeros(num_steps, num_envs, dtype=torch.bool, device=device)
+        self._skill = torch.zeros(num_steps * num_envs, dtype=torch.int64, device=device)
         self._rewards = torch.zeros(num_steps, num_envs, device=device)
         self._step = 0
+        self._train = Recorded(self._train_step, device, carried=self._carried, communicates=True)
+
+    def _carried(self) -> list[tuple[object, str]]:
+        """Return what a training step reads and others replace; see `Recorded`."""
+        expert = [(self.selector, name) for name in ("scores", "trajectories")]
+        return [*expert, (self, "_skill")]
 
     @classmethod
     def build(
@@ -112,11 +122,10 @@ class SelfImitation:
         one_hot = storage.observations[names.SKILL]
         scalars = self._describe(one_hot)
         self.selector.select(iteration)
-        pairs, valid = self._pairs.flatten(0, 1), self._valid.flatten()
-        skill = one_hot.flatten(0, 1).argmax(dim=-1)
-        noise = piecewise_linear(self.config.discriminator.noise, progress)
+        self._skill = one_hot.flatten(0, 1).argmax(dim=-1)
+        self._noise_factor.fill_(piecewise_linear(self.config.discriminator.noise, progress))
         for _ in range(self.config.discriminator.updates):
-            loss, expert, policy = self._train_step(pairs, valid, skill, noise)
+            loss, expert, policy = self._train()
         self._step = 0
         scalars |= {
             "Discriminator/loss": loss.item(),
@@ -125,18 +134,17 @@ class SelfImitation:
         }
         return scalars | self._describe_buffer(iteration)
 
-    def _train_step(
-        self, pairs: torch.Tensor, valid: torch.Tensor, skill: torch.Tensor, noise: float
-    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    def _train_step(self) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """Take one step on a batch; experts show the same skills as the policy's pairs.
 
         Other proportions would reward a skill for being frequent: its code is an input.
         """
+        pairs, valid = self._pairs.flatten(0, 1), self._valid.flatten()
         size = self.config.discriminator.batch_size
         drawn = torch.randint(len(pairs), (size,), device=pairs.device)
-        expert = self.selector.sample(skill[drawn])
+        expert = self.selector.sample(self._skill[drawn])
         both = torch.cat([expert, pairs[drawn]])
-        both = both + noise * self._noise * torch.randn_like(both)
+        both = both + self._noise_factor * self._noise * torch.randn_like(both)
         expert_score, policy_score = self.discriminator(both).chunk(2)
         loss = discriminator_loss(expert_score, policy_score, valid[drawn])
         weight = self.config.discriminator.gradient_penalty
@@ -180,7 +188,8 @@ class SelfImitation:
     def load_state_dict(self, state: dict) -> None:
         """Go on from a saved state."""
         self.discriminator.load_state_dict(state["discriminator"])
-        self.optimizer.load_state_dict(state["optimizer"])
+        load_adam(self.optimizer, state["optimizer"], self._device)
+        self._train.forget()
         self.selector.load_state_dict(state["selector"])
 
 

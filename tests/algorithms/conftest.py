@@ -77,7 +77,8 @@ class CountingEnv(SkillEnv):
             names.EXTRA_VALID: torch.ones(self.num_envs, dtype=torch.bool),
             names.EXTRA_FLAT: self.is_flat,
             names.NEXT_PROPRIO: torch.randn(self.num_envs, 4),
-            "log": {"Perf/physics_time": torch.tensor(0.0)},
+            names.EXTRA_PHYSICS_TIME: 0.0,
+            "log": {},
         }
         self.episode += ends
         self.episode_length_buf = torch.where(ends, 0, self.episode_length_buf)

@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from kiras_rl.algorithms.kiras import IMITATION, TASK
+from kiras_rl.phases import FINETUNING, SKILL_LEARNING
 
 PARTS = ("imitation", "multi_critic", "estimator", "skill_init")
 
@@ -177,3 +178,19 @@ def test_a_saved_learner_goes_on(make_runner):
     again = other.alg.save()
     assert again.keys() == saved.keys()
     assert torch.equal(again["skill_probabilities"], saved["skill_probabilities"])
+
+
+@pytest.mark.parametrize("phase", [SKILL_LEARNING, FINETUNING])
+def test_replayed_updates_are_the_same(make_runner, taped, phase):
+    plain, replayed = (make_runner("learner.estimator.epochs=3", phase=phase) for _ in range(2))
+    recorded = [replayed.alg._epoch, replayed.alg.estimation._epoch]
+    recorded += [replayed.alg.imitation._train] if replayed.alg.imitation else []
+    for part in recorded:
+        part.records = True
+    for runner in (plain, replayed):
+        torch.manual_seed(2)
+        runner.learn(3)
+    assert all(part._recording is not None for part in recorded)
+    expected = networks(plain.alg)
+    for name, weights in networks(replayed.alg).items():
+        assert torch.equal(weights, expected[name]), name

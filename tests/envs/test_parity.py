@@ -148,7 +148,6 @@ def test_cuda_step_waits_for_nothing(simulations, drill):
             sim.step(target)
             sim.write_state(everywhere, sim.qpos, sim.qvel, target)
             sim.write_velocity(everywhere, sim.qvel)
-            sim.set_const(everywhere)
     finally:
         torch.cuda.set_sync_debug_mode("default")
 

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import copy
+
+import mujoco
 import pytest
 import torch
 
@@ -99,6 +102,18 @@ def test_physics_is_drawn_anew_at_a_reset_and_stays_until_then(build_env):
     for name in names:
         changed = (field(env, name) != before[name]).flatten(1).any(dim=1)
         assert changed.tolist() == [i == 3 for i in range(8)], name
+
+
+def test_constants_follow_from_the_masses(build_env):
+    env = build_env(num_envs=4)
+    model, data = copy.copy(env.sim.model), mujoco.MjData(env.sim.model)
+    for world in range(4):
+        model.body_mass[:] = field(env, "body_mass")[world].numpy()
+        model.body_ipos[:] = field(env, "body_ipos")[world].numpy()
+        mujoco.mj_setConst(model, data)
+        for name in ("body_subtreemass", "body_invweight0", "dof_invweight0"):
+            expected = torch.tensor(getattr(model, name)).float()
+            torch.testing.assert_close(field(env, name)[world], expected, rtol=1e-5, atol=0)
 
 
 def test_without_randomization_physics_is_nominal(build):

@@ -35,7 +35,6 @@ def change_physics(sim, drill, worlds):
         sim.write_field(field, mask, drill.nominal(sim, field) * factor)
     sim.write_field("body_ipos", mask, drill.nominal(sim, "body_ipos") + 0.01)
     sim.write_field("actuator_delay", mask, drill.nominal(sim, "actuator_delay") + 0.0075)
-    sim.set_const(mask)
 
 
 def test_starts_where_it_is_told_to(sim, drill):
@@ -80,16 +79,6 @@ def test_writes_touch_no_other_world(sim, drill, assert_same_motion):
     assert_same_motion(undisturbed, motion, worlds=(0, 2))
     for world in (1, 3):
         assert (motion["qpos"][:, world] - undisturbed["qpos"][:, world]).abs().max() > 1e-2
-
-
-def test_set_const_keeps_the_state(sim, drill):
-    drill.begin(sim)
-    drill.run(sim)
-    qpos, qvel = sim.qpos.clone(), sim.qvel.clone()
-    sim.write_field("body_mass", drill.mask(sim, ALL), drill.nominal(sim, "body_mass") * 2)
-    sim.set_const(drill.mask(sim, ALL))
-    assert (sim.qpos == qpos).all()
-    assert (sim.qvel == qvel).all()
 
 
 def test_delay_counts_physics_steps(sim, drill):

@@ -1,0 +1,144 @@
+"""A function of tensors as one CUDA graph: hundreds of small kernels for one launch.
+
+A step of the environment, or of an optimizer, is many operations on small tensors, and on a GPU
+each costs the host more time to launch than the device to compute. A graph replays them all at the
+addresses that they had when it was recorded. So what goes on from call to call has to stay where it
+is, and what a call hands out has to be copied before the next one writes there.
+"""
+
+from __future__ import annotations
+
+import gc
+from collections.abc import Callable, Hashable, Iterable
+from operator import attrgetter
+from typing import TypeVar
+
+import torch
+from torch.utils._pytree import tree_flatten, tree_unflatten
+
+from kiras_rl import distributed
+
+T = TypeVar("T")
+Slot = tuple[object, str]  # an attribute: its owner, and its name with dots
+
+WARM_UP = 2  # calls before the recording: libraries and optimizers allocate at their first
+
+
+class Recorded:
+    """Calls a function; on CUDA records it after a few calls and replays it from then on."""
+
+    def __init__(
+        self,
+        function: Callable[[], T],
+        device: torch.device | str,
+        carried: Callable[[], Iterable[Slot]] = tuple,
+        renewed: Iterable[object] = (),
+        variant: Callable[[], Hashable] = tuple,
+        communicates: bool = False,
+    ) -> None:
+        """Take the function; nothing is called yet.
+
+        Args:
+            function: Reads tensors and returns others, in tuples and dictionaries. Its operations
+                depend on no value of a tensor. Random numbers are those of torch's own generator.
+            device: Where the tensors are; anywhere but on CUDA the function is simply called.
+            carried: Attributes that it reads and replaces. They may be replaced from outside
+                between two calls, by tensors of the same shape; no other that it reads may.
+            renewed: Objects whose attributes it only replaces, with what others read later.
+            variant: What else decides which operations run; a new value is a new recording.
+            communicates: Whether ranks wait for each other in it; then several are not recorded.
+        """
+        self._function, self._carried, self._variant = function, carried, variant
+        self._renewed = tuple(renewed)
+        alone = distributed.size() == 1 or not communicates
+        self.records = alone and torch.device(device).type == "cuda"
+        self._recording: _Recording | None = None
+        self._of: Hashable = None  # of no variant
+        self._calls = 0
+
+    def __call__(self) -> T:
+        """Return what the function returns, in tensors that no later call changes."""
+        if not self.records:
+            return self._function()
+        variant = self._variant()
+        if variant != self._of:
+            self._of, self._calls, self._recording = variant, 0, None
+        self._calls += 1
+        if self._calls <= WARM_UP:
+            return _aside(self._function)
+        if self._recording is None:
+            self._recording = _Recording(self._function, self._carried(), self._renewed)
+        return self._recording.replay()
+
+    def forget(self) -> None:
+        """Record anew: tensors that the function reads and that are not carried were replaced."""
+        self._of = None
+
+
+class _Recording:
+    """A graph, the tensors that it reads and replaces, and those that it returns."""
+
+    def __init__(
+        self, function: Callable[[], tuple], carried: Iterable[Slot], renewed: tuple[object, ...]
+    ) -> None:
+        self._slots = [(slot, attrgetter(slot[1])(slot[0]).clone()) for slot in carried]
+        self._bind()
+        gc.collect()  # what a finalizer frees would become part of the recording
+        self._graph = torch.cuda.CUDAGraph()
+        with torch.cuda.graph(self._graph):
+            self._outputs, self._structure = tree_flatten(function())
+            self._bind()
+        self._after = [(owner, dict(vars(owner))) for owner in renewed]
+
+    def _bind(self) -> None:
+        """Bring what was replaced, from outside or by the function, to where the graph reads it."""
+        current = [(attrgetter(slot[1])(slot[0]), slot, tensor) for slot, tensor in self._slots]
+        # Copies first: one value may be what another one overwrites, or a view of it.
+        new = [(value.clone(), *where) for value, *where in current if value is not where[1]]
+        for value, slot, tensor in new:
+            tensor.copy_(value)
+            _set(slot, tensor)
+
+    def replay(self) -> tuple:
+        self._bind()
+        self._graph.replay()
+        for owner, attributes in self._after:
+            vars(owner).update(attributes)
+        return tree_unflatten(_copies(self._outputs), self._structure)
+
+
+def _aside(function: Callable[[], T]) -> T:
+    """Call on a stream of its own: what autograd remembers of the main one cannot be recorded."""
+    if not torch.cuda.is_available():
+        return function()
+    stream = torch.cuda.Stream()
+    stream.wait_stream(torch.cuda.current_stream())
+    with torch.cuda.stream(stream):
+        result = function()
+    torch.cuda.current_stream().wait_stream(stream)
+    return result
+
+
+def _set(slot: Slot, value: torch.Tensor) -> None:
+    owner, (*path, name) = slot[0], slot[1].split(".")
+    for step in path:
+        owner = getattr(owner, step)
+    setattr(owner, name, value)
+
+
+def copied(tree: T) -> T:
+    """Return nested tuples and dictionaries with copies of their tensors."""
+    leaves, structure = tree_flatten(tree)
+    where = [i for i, leaf in enumerate(leaves) if isinstance(leaf, torch.Tensor)]
+    for i, copy in zip(where, _copies([leaves[i] for i in where]), strict=True):
+        leaves[i] = copy
+    return tree_unflatten(leaves, structure)
+
+
+def _copies(tensors: list[torch.Tensor]) -> list[torch.Tensor]:
+    """Return copies; those of numbers by few kernels for all."""
+    copies = [torch.empty_like(tensor) for tensor in tensors]
+    for dtype in {tensor.dtype for tensor in tensors}:
+        group = [i for i, tensor in enumerate(tensors) if tensor.dtype == dtype]
+        torch._foreach_copy_([copies[i] for i in group], [tensors[i] for i in group])
+    return copies

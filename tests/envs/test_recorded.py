@@ -1,0 +1,71 @@
+"""Steps replayed from a CUDA graph are those of the environment; see `taped` for the CPU."""
+
+import pytest
+import torch
+
+from kiras_rl.config import load_config
+from kiras_rl.envs import make_env
+from kiras_rl.phases import FINETUNING, SKILL_LEARNING, phase_config
+
+
+def build(cfg, phase, device):
+    small = ("num_envs=6", "env.terminations.episode_length=0.3", "sim.backend=warp")
+    terrain = "finetuning.env.terrain={levels: 2, variants: 1}"
+    config = load_config(cfg, [*small, terrain, f"device={device}"])
+    return make_env(phase_config(config, phase), device)
+
+
+def assert_same(one, other):
+    assert one.keys() == other.keys()
+    for name, value in one.items():
+        if isinstance(value, torch.Tensor):
+            assert torch.equal(value.nan_to_num(9.0), other[name].nan_to_num(9.0)), name
+        elif isinstance(value, dict):
+            assert_same(value, other[name])
+
+
+def drive(env):
+    """Step, with all that may happen between two steps, and return what was seen."""
+    generator, n = torch.Generator().manual_seed(3), env.num_envs
+
+    def steps(count):
+        seen = []
+        for _ in range(count):
+            actions = 2 * torch.rand(n, env.num_actions, generator=generator) - 1
+            obs, rewards, dones, extras = env.step(actions.to(env.device))
+            extras.pop("physics_time")
+            seen.append(obs.to_dict() | {"rewards": rewards, "dones": dones} | extras)
+            seen.append(vars(env.measure()))
+        return seen
+
+    seen = steps(20)
+    env.episode_length_buf = torch.arange(n)
+    env.set_skill_probabilities(torch.tensor([0.0, 0.5, 0.5, 0.0, 0.0]))
+    seen += [env.get_observations().to_dict(), *steps(20)]
+    saved = env.state_dict()
+    seen += [env.reset().to_dict(), *steps(4)]
+    env.load_state_dict(saved)
+    skill = torch.arange(n, device=env.device) % 5
+    command = torch.full((n, 3), 0.1, device=env.device)
+    seen += [*steps(4), env.set_task(skill, command).to_dict(), *steps(10)]
+    seen += [env.set_task(skill.flip(0), 2 * command).to_dict(), *steps(4)]
+    return seen, env.state_dict()
+
+
+@pytest.mark.parametrize("phase", [SKILL_LEARNING, FINETUNING])
+@pytest.mark.parametrize("device", ["cpu", pytest.param("cuda", marks=pytest.mark.gpu)])
+def test_replayed_steps_are_the_same(phase, device, request, monkeypatch):
+    plain, replayed = build("solo8", phase, device), build("solo8", phase, device)
+    plain._advance.records = False
+    replayed._advance.records = True
+    if device == "cpu":
+        request.getfixturevalue("taped")
+    (expected, end), (seen, end_seen) = drive(plain), drive(replayed)
+    assert replayed._advance._recording is not None
+    for step, (a, b) in enumerate(zip(expected, seen, strict=True)):
+        try:
+            assert_same(a, b)
+        except AssertionError as error:
+            raise AssertionError(f"step {step}: {error}") from None
+    end.pop("generator"), end_seen.pop("generator")
+    assert_same(end, end_seen)
