@@ -33,6 +33,7 @@ from kiras_rl.recorded import Recorded, copied
 from kiras_rl.robots.robot import Robot
 from kiras_rl.schema import EnvConfig, SimConfig
 
+COMPILED = 1024  # worlds; fewer are bound by launches, which a graph takes away by itself
 KEYFRAME_COMMANDS = (0.0, 0.4, 0.8)  # of the largest v_x, for the value of a skill
 
 
@@ -131,6 +132,7 @@ class QuadrupedEnv(SkillEnv):
             carried=self._carried,
             renewed=(self.robot, self._observer),
             variant=lambda: (self._held, self._placed is None),
+            compiled=self.num_envs >= COMPILED,
         )
 
     def _carried(self) -> list[tuple[object, str]]:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import functools
-
 import numpy as np
 import torch
 from torch.nn.functional import normalize
@@ -25,16 +23,20 @@ def matrix(quat: torch.Tensor) -> torch.Tensor:
     return (products @ _of_products(quat.device, quat.dtype)).unflatten(1, (3, 3))
 
 
-@functools.cache
+_PRODUCTS: dict[tuple[torch.device, torch.dtype], torch.Tensor] = {}
+
+
 def _of_products(device: torch.device, dtype: torch.dtype) -> torch.Tensor:
     """Return what each product adds to each entry of (w^2 - u.u) 1 + 2 u u' + 2 w [u]x, (16, 9)."""
-    one, terms = np.eye(3), np.zeros((4, 4, 3, 3))
-    terms[0, 0] = one
-    for i in range(3):
-        terms[1 + i, 1 + i] -= one
-        terms[1 + i, 1:, i] += 2.0 * one
-        terms[0, 1 + i] = 2.0 * np.cross(one[i], one).T
-    return torch.tensor(terms.reshape(16, 9), device=device, dtype=dtype)
+    if (device, dtype) not in _PRODUCTS:
+        one, terms = np.eye(3), np.zeros((4, 4, 3, 3))
+        terms[0, 0] = one
+        for i in range(3):
+            terms[1 + i, 1 + i] -= one
+            terms[1 + i, 1:, i] += 2.0 * one
+            terms[0, 1 + i] = 2.0 * np.cross(one[i], one).T
+        _PRODUCTS[device, dtype] = torch.tensor(terms.reshape(16, 9), device=device, dtype=dtype)
+    return _PRODUCTS[device, dtype]
 
 
 def projected_gravity(rotation: torch.Tensor) -> torch.Tensor:

@@ -9,6 +9,7 @@ is, and what a call hands out has to be copied before the next one writes there.
 from __future__ import annotations
 
 import gc
+import logging
 from collections.abc import Callable, Hashable, Iterable
 from operator import attrgetter
 from typing import TypeVar
@@ -17,6 +18,8 @@ import torch
 from torch.utils._pytree import tree_flatten, tree_unflatten
 
 from kiras_rl import distributed
+
+_log = logging.getLogger(__name__)
 
 T = TypeVar("T")
 Slot = tuple[object, str]  # an attribute: its owner, and its name with dots
@@ -35,6 +38,7 @@ class Recorded:
         renewed: Iterable[object] = (),
         variant: Callable[[], Hashable] = tuple,
         communicates: bool = False,
+        compiled: bool = False,
     ) -> None:
         """Take the function; nothing is called yet.
 
@@ -47,11 +51,16 @@ class Recorded:
             renewed: Objects whose attributes it only replaces, with what others read later.
             variant: What else decides which operations run; a new value is a new recording.
             communicates: Whether ranks wait for each other in it; then several are not recorded.
+            compiled: Whether torch.compile fuses its operations first, which takes half a minute.
         """
-        self._function, self._carried, self._variant = function, carried, variant
+        self._plain, self._carried, self._variant = function, carried, variant
         self._renewed = tuple(renewed)
         alone = distributed.size() == 1 or not communicates
         self.records = alone and torch.device(device).type == "cuda"
+        self._function = function
+        if self.records and compiled:
+            self._function = torch.compile(function, fullgraph=True, dynamic=False)
+        self._slots: list[tuple[Slot, torch.Tensor]] = []
         self._recording: _Recording | None = None
         self._of: Hashable = None  # of no variant
         self._calls = 0
@@ -59,16 +68,29 @@ class Recorded:
     def __call__(self) -> T:
         """Return what the function returns, in tensors that no later call changes."""
         if not self.records:
-            return self._function()
+            return self._plain()
         variant = self._variant()
         if variant != self._of:
             self._of, self._calls, self._recording = variant, 0, None
+            self._slots = [(slot, attrgetter(slot[1])(slot[0]).clone()) for slot in self._carried()]
         self._calls += 1
+        _bind(self._slots)
         if self._calls <= WARM_UP:
-            return _aside(self._function)
+            return self._warm_up()
         if self._recording is None:
-            self._recording = _Recording(self._function, self._carried(), self._renewed)
+            self._recording = _Recording(self._function, self._slots, self._renewed)
         return self._recording.replay()
+
+    def _warm_up(self) -> T:
+        from torch._dynamo.exc import TorchDynamoException  # a second to import
+
+        try:
+            return _aside(self._function)
+        except TorchDynamoException as error:  # no compiler for C, say
+            reason = " ".join(str(error).split())[:200]
+            _log.warning("torch.compile failed, training goes on a little slower: %s", reason)
+            self._function = self._plain
+            return _aside(self._function)
 
     def forget(self) -> None:
         """Record anew: tensors that the function reads and that are not carried were replaced."""
@@ -79,32 +101,33 @@ class _Recording:
     """A graph, the tensors that it reads and replaces, and those that it returns."""
 
     def __init__(
-        self, function: Callable[[], tuple], carried: Iterable[Slot], renewed: tuple[object, ...]
+        self,
+        function: Callable[[], tuple],
+        slots: list[tuple[Slot, torch.Tensor]],
+        renewed: tuple[object, ...],
     ) -> None:
-        self._slots = [(slot, attrgetter(slot[1])(slot[0]).clone()) for slot in carried]
-        self._bind()
         gc.collect()  # what a finalizer frees would become part of the recording
         self._graph = torch.cuda.CUDAGraph()
         with torch.cuda.graph(self._graph):
             self._outputs, self._structure = tree_flatten(function())
-            self._bind()
+            _bind(slots)
         self._after = [(owner, dict(vars(owner))) for owner in renewed]
 
-    def _bind(self) -> None:
-        """Bring what was replaced, from outside or by the function, to where the graph reads it."""
-        current = [(attrgetter(slot[1])(slot[0]), slot, tensor) for slot, tensor in self._slots]
-        # Copies first: one value may be what another one overwrites, or a view of it.
-        new = [(value.clone(), *where) for value, *where in current if value is not where[1]]
-        for value, slot, tensor in new:
-            tensor.copy_(value)
-            _set(slot, tensor)
-
     def replay(self) -> tuple:
-        self._bind()
         self._graph.replay()
         for owner, attributes in self._after:
             vars(owner).update(attributes)
         return tree_unflatten(_copies(self._outputs), self._structure)
+
+
+def _bind(slots: list[tuple[Slot, torch.Tensor]]) -> None:
+    """Bring what was replaced, from outside or by the function, to where it is read."""
+    current = [(attrgetter(slot[1])(slot[0]), slot, tensor) for slot, tensor in slots]
+    # Copies first: one value may be what another one overwrites, or a view of it.
+    new = [(value.clone(), *where) for value, *where in current if value is not where[1]]
+    for value, slot, tensor in new:
+        tensor.copy_(value)
+        _set(slot, tensor)
 
 
 def _aside(function: Callable[[], T]) -> T:

@@ -11,7 +11,11 @@ _INTERVAL = 64  # steps between two looks on CUDA
 
 
 class OverflowMonitor:
-    """Collects the overflow bits of all worlds and warns of each budget once."""
+    """Looks at the overflow bits of all worlds and warns of each budget once.
+
+    Attributes:
+        seen: All bits that a world has shown, (N,) int32; the simulation adds to them.
+    """
 
     def __init__(self, budgets: dict[int, str], num_worlds: int, device: torch.device) -> None:
         """Allocate.
@@ -23,16 +27,15 @@ class OverflowMonitor:
         """
         self._budgets = list(budgets.values())
         self._masks = torch.tensor(list(budgets), dtype=torch.int32, device=device)
-        self._seen = torch.zeros(num_worlds, dtype=torch.int32, device=device)
+        self.seen = torch.zeros(num_worlds, dtype=torch.int32, device=device)
         # A copy into pinned memory does not wait; what it brought is read an interval later.
         self._on_gpu = device.type == "cuda"
         self._worlds = torch.zeros(len(budgets), dtype=torch.int64, pin_memory=self._on_gpu)
         self._warned: set[str] = set()
         self._steps = 0
 
-    def record(self, bits: torch.Tensor) -> None:
-        """Take the bits of one step, (N,) int32."""
-        self._seen |= bits
+    def look(self) -> None:
+        """Count the bits once a step."""
         self._steps += 1
         if not self._on_gpu:
             self._count()
@@ -42,7 +45,7 @@ class OverflowMonitor:
             self._count()
 
     def _count(self) -> None:
-        worlds = (self._seen[:, None] & self._masks).ne(0).sum(dim=0)
+        worlds = (self.seen[:, None] & self._masks).ne(0).sum(dim=0)
         self._worlds.copy_(worlds, non_blocking=True)
 
     def _warn(self) -> None:

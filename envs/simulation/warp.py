@@ -40,6 +40,38 @@ _BUDGETS = {
 """What overflowed, and the key to change."""
 
 
+_SENSOR_CONTACTS = 16
+"""Contacts of a geom that its sensor adds up at most: its memory is cleared in every step."""
+
+
+@wp.kernel
+def _read_warnings(
+    qpos: wp.array2d[float],
+    qvel: wp.array2d[float],
+    ctrl: wp.array2d[float],
+    lost: int,
+    overflow: wp.array[int],
+    seen: wp.array[int],
+    diverged: wp.array[wp.bool],
+    overflowed: wp.array[wp.bool],
+) -> None:
+    """Tell which worlds broke, by their state and by what of `overflow` loses contacts."""
+    world = wp.tid()
+    limit = float(mujoco.mjMAXVAL)  # what MuJoCo itself calls bad; NaN is not below it either
+    sound = bool(True)
+    for i in range(qpos.shape[1]):
+        sound = sound and wp.abs(qpos[world, i]) <= limit
+    for i in range(qvel.shape[1]):
+        sound = sound and wp.abs(qvel[world, i]) <= limit
+    for i in range(ctrl.shape[1]):
+        sound = sound and wp.abs(ctrl[world, i]) <= limit
+    bits = overflow[world]
+    diverged[world] = not sound
+    overflowed[world] = (bits & lost) != 0
+    seen[world] = seen[world] | bits
+    overflow[world] = 0
+
+
 class WarpSimulation:
     """The Simulation protocol over `mujoco_warp`; see base.py for the members.
 
@@ -99,6 +131,10 @@ class WarpSimulation:
         sizes = dict.fromkeys(fields, n)
         self._m = mjw.put_model(self.model, batch_sizes=sizes)
         self._m.opt.warn_overflow = 0  # printed by the kernels; counted here instead
+        self._m.opt.contact_sensor_maxmatch = _SENSOR_CONTACTS
+        # The slowest world takes nearly all iterations, and a graph that asks after each whether
+        # to go on costs more than the iterations that it saves, and keeps the host waiting.
+        self._m.opt.graph_conditional = False
         if max_ccd is not None:
             max_ccd = min(max_ccd, max_contacts)
         self._d = mjw.make_data(
@@ -172,24 +208,24 @@ class WarpSimulation:
         self.sensor_record.zero_()
 
     def _launch_control_step(self) -> None:
+        data = self._d
         for k in range(self._substeps):
-            mjw.step(self._m, self._d)
-            wp.copy(self._record[k], self._d.sensordata)
+            mjw.step(self._m, data)
+            wp.copy(self._record[k], data.sensordata)
+        wp.launch(
+            _read_warnings,
+            dim=self.num_worlds,
+            inputs=[data.qpos, data.qvel, data.ctrl, _OVERFLOW, data.overflow],
+            outputs=[
+                wp.from_torch(x) for x in (self._monitor.seen, self.diverged, self.overflowed)
+            ],
+        )
 
     def step(self, ctrl: torch.Tensor) -> None:
         """Advance every world by one control step."""
         self._ctrl.copy_(ctrl)
         self._control_step()
-        self._read_warnings()
-
-    def _read_warnings(self) -> None:
-        values = torch.cat([self.qpos, self.qvel, self._ctrl], dim=1)
-        # What MuJoCo itself would not call bad; NaN is neither less nor more
-        sound = (values.abs() <= mujoco.mjMAXVAL).all(1)
-        torch.logical_not(sound, out=self.diverged)
-        torch.ne(self._overflow & _OVERFLOW, 0, out=self.overflowed)
-        self._monitor.record(self._overflow)
-        self._overflow.zero_()
+        self._monitor.look()
 
     def write_state(
         self, mask: torch.Tensor, qpos: torch.Tensor, qvel: torch.Tensor, ctrl: torch.Tensor

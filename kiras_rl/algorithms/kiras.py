@@ -242,6 +242,7 @@ class KirasPPO(PPO):
         for network in (self.actor, *self.critic.critics):
             nn.utils.clip_grad_norm_(network.parameters(), self.max_grad_norm)
         self.optimizer.step()
+        distribution.update(distribution.mean.detach())  # keeps nothing of this step alive
         return torch.stack([surrogate, value, kl]).detach()
 
     @torch.no_grad()
