@@ -12,6 +12,7 @@ from kiras_rl.robots.robot import Robot
 
 _OBJ = mujoco.mjtObj
 _SENSOR = mujoco.mjtSensor
+TOLERANCE = 1e-4  # of the solver; below it motions change less than by any other option
 _NET_FORCE = 3  # contact sensor: sum of all contact forces, in the world frame
 
 
@@ -82,6 +83,7 @@ def build_scene(
     spec.option.timestep = timestep
     spec.option.iterations = solver_iterations
     spec.option.ls_iterations = solver_iterations
+    spec.option.tolerance = TOLERANCE
     if max_delay:
         for actuator in spec.actuators:
             actuator.nsample = max_delay

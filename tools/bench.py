@@ -42,9 +42,9 @@ Measure how fast training is here and what each part of it costs. Absolute times
 machine and on what else runs; every figure that counts is therefore a ratio of two variants that
 took turns, and the median over the rounds.
 
-physics    steps a second of the environment, against mujoco.batch alone on the same model, states
-           and targets; target: at least 80 % of its speed. Then the parts of an environment step.
-           Always the native backend on the CPU.
+physics    steps a second of the environment, against mujoco.batch or mujoco_warp alone on the same
+           model, states and targets; target: at least 80 % of its speed, 90 % on a GPU. Then the
+           parts of an environment step.
 terrain    the same on the terrain with which finetuning begins: against mujoco.batch alone on it,
            target 75 % of its speed, and against flat ground, target at most 2.5 times as long
 learning   seconds of an iteration of KiRAS, against stock rsl-rl PPO with the same networks, epochs
@@ -72,7 +72,7 @@ examples:
   kiras-bench --out figures                       the first six parts, Solo-8, 1024 worlds
   kiras-bench --parts physics --worlds 4096       the environment alone
   kiras-bench --parts scale --plot --out figures  pictures, too
-  kiras-bench --parts scale --worlds 512,2048     these numbers of worlds
+  kiras-bench --parts scale --worlds 512,2048     these numbers of worlds, nothing else
   kiras-bench --parts scale sim.backend=warp      the other backend
   kiras-bench --parts peer --peer /opt/mjlab/bin/python
   kiras-bench sim.threads=1 sim.substeps=8        any key of the configuration

@@ -126,7 +126,6 @@ def build(
         PolicyError: A policy that could not be exported.
     """
     device = resolve_device(config.device)
-    torch.set_float32_matmul_precision("high")  # TF32, where a GPU has it
     alone = phase_config(config, phase)
     alone.seed += distributed.rank()  # every rank has worlds of its own, and its share of the cores
     alone.sim.threads = alone.sim.threads or distributed.core_share()

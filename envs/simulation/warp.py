@@ -7,6 +7,7 @@ in Warp's cache: ~/.cache/warp, or the folder that WARP_CACHE_PATH names.
 from __future__ import annotations
 
 import contextlib
+import copy
 import functools
 import gc
 import logging
@@ -14,6 +15,7 @@ from collections.abc import Callable, Iterator
 
 import mujoco
 import mujoco_warp as mjw
+import numpy as np
 import torch
 import warp as wp
 
@@ -35,13 +37,29 @@ _BUDGETS = {
     int(_Bits.NEFC | _Bits.NJMAX_NNZ): "too few constraint rows, raise sim.max_constraints,",
     int(_Bits.CCD | _Bits.EPA_HORIZON): "too few pairs with a height field, raise sim.max_ccd,",
     int(_Bits.HFIELD): "too fine a height field, raise env.terrain.cell,",
-    int(_Bits.CONTACT_MATCH): "more contacts on one geom than its sensor takes",
 }
 """What overflowed, and the key to change."""
 
 
-_SENSOR_CONTACTS = 16
-"""Contacts of a geom that its sensor adds up at most: its memory is cleared in every step."""
+@wp.kernel
+def _add_contact_forces(
+    force: wp.array[wp.spatial_vector],
+    geom: wp.array[wp.vec2i],
+    world: wp.array[int],
+    count: wp.array[int],
+    column: wp.array[int],
+    record: wp.array2d[float],
+) -> None:
+    """Add the force of each contact, in the world frame, to the sensors of its two geoms."""
+    contact = wp.tid()
+    if contact >= count[0]:
+        return
+    for side in range(2):
+        first = column[geom[contact][side]]
+        if first >= 0:
+            sign = 1.0 - 2.0 * float(side)  # the force is that on the first geom
+            for i in range(3):
+                wp.atomic_add(record, world[contact], first + i, sign * force[contact][i])
 
 
 @wp.kernel
@@ -58,15 +76,15 @@ def _read_warnings(
     """Tell which worlds broke, by their state and by what of `overflow` loses contacts."""
     world = wp.tid()
     limit = float(mujoco.mjMAXVAL)  # what MuJoCo itself calls bad; NaN is not below it either
-    sound = bool(True)
+    broken = int(0)  # noqa: UP018, RUF046, a variable of Warp and not a constant
     for i in range(qpos.shape[1]):
-        sound = sound and wp.abs(qpos[world, i]) <= limit
+        broken += wp.where(wp.abs(qpos[world, i]) <= limit, 0, 1)
     for i in range(qvel.shape[1]):
-        sound = sound and wp.abs(qvel[world, i]) <= limit
+        broken += wp.where(wp.abs(qvel[world, i]) <= limit, 0, 1)
     for i in range(ctrl.shape[1]):
-        sound = sound and wp.abs(ctrl[world, i]) <= limit
+        broken += wp.where(wp.abs(ctrl[world, i]) <= limit, 0, 1)
     bits = overflow[world]
-    diverged[world] = not sound
+    diverged[world] = broken > 0
     overflowed[world] = (bits & lost) != 0
     seen[world] = seen[world] | bits
     overflow[world] = 0
@@ -129,9 +147,9 @@ class WarpSimulation:
         n = self.num_worlds
         fields = RANDOMISED_FIELDS + (TERRAIN_FIELDS if terrain else ())
         sizes = dict.fromkeys(fields, n)
-        self._m = mjw.put_model(self.model, batch_sizes=sizes)
+        model, columns = _without_contact_sensors(self.model)
+        self._m = mjw.put_model(model, batch_sizes=sizes)
         self._m.opt.warn_overflow = 0  # printed by the kernels; counted here instead
-        self._m.opt.contact_sensor_maxmatch = _SENSOR_CONTACTS
         # The slowest world takes nearly all iterations, and a graph that asks after each whether
         # to go on costs more than the iterations that it saves, and keeps the host waiting.
         self._m.opt.graph_conditional = False
@@ -141,6 +159,10 @@ class WarpSimulation:
             self.model, n, nconmax=max_contacts, njmax=max_constraints, nccdmax=max_ccd
         )
         self._record = wp.zeros((self._substeps, n, self.model.nsensordata), dtype=float)
+        contacts = self._d.naconmax
+        self._contact_ids = wp.array(np.arange(contacts, dtype=np.int32))
+        self._contact_force = wp.zeros(contacts, dtype=wp.spatial_vector)
+        self._columns = wp.array(columns)
 
     def _bind_state(self) -> None:
         """Make tensors that share memory with Warp's arrays: written in place, never replaced."""
@@ -212,6 +234,7 @@ class WarpSimulation:
         for k in range(self._substeps):
             mjw.step(self._m, data)
             wp.copy(self._record[k], data.sensordata)
+            self._launch_contact_forces(self._record[k])
         wp.launch(
             _read_warnings,
             dim=self.num_worlds,
@@ -219,6 +242,16 @@ class WarpSimulation:
             outputs=[
                 wp.from_torch(x) for x in (self._monitor.seen, self.diverged, self.overflowed)
             ],
+        )
+
+    def _launch_contact_forces(self, record: wp.array2d[float]) -> None:
+        data, contact = self._d, self._d.contact
+        mjw.contact_force(self._m, data, self._contact_ids, True, self._contact_force)
+        wp.launch(
+            _add_contact_forces,
+            dim=data.naconmax,
+            inputs=[self._contact_force, contact.geom, contact.worldid, data.nacon, self._columns],
+            outputs=[record],
         )
 
     def step(self, ctrl: torch.Tensor) -> None:
@@ -294,20 +327,38 @@ class _Launches:
             self._graph = recording.graph
 
     def __call__(self) -> None:
-        with self._scope():
+        with on_stream_of_torch(self._device):
             if self._graph is None:
                 self._launch()
             else:
                 wp.capture_launch(self._graph)
 
-    def _scope(self) -> contextlib.AbstractContextManager:
-        if self._device.is_cpu:
-            return wp.ScopedDevice(self._device)
-        stream = torch.cuda.current_stream(wp.device_to_torch(self._device))
-        return wp.ScopedStream(_warp_stream(stream), sync_enter=False)
+
+def on_stream_of_torch(device: wp.Device) -> contextlib.AbstractContextManager:
+    """Let Warp launch on a device where torch launches now: neither waits for the other."""
+    if device.is_cpu:
+        return wp.ScopedDevice(device)
+    stream = torch.cuda.current_stream(wp.device_to_torch(device))
+    return wp.ScopedStream(_warp_stream(stream), sync_enter=False)
 
 
 _warp_stream = functools.lru_cache(maxsize=None)(wp.stream_from_torch)
+
+
+def _without_contact_sensors(model: mujoco.MjModel) -> tuple[mujoco.MjModel, np.ndarray]:
+    """Return the model without its sensors of net contact forces, which are added up here.
+
+    mujoco_warp sorts the contacts of every sensor first, which takes an eighth of a step.
+
+    Returns:
+        The model, and for each geom the column of its sensor in the sensor data, -1 for none.
+    """
+    model = copy.copy(model)
+    columns = np.full(model.ngeom, -1, dtype=np.int32)
+    ids = np.flatnonzero(model.sensor_type == int(mujoco.mjtSensor.mjSENS_CONTACT))
+    columns[model.sensor_objid[ids]] = model.sensor_adr[ids]
+    model.sensor_type[ids] = int(mujoco.mjtSensor.mjSENS_USER)
+    return model, columns
 
 
 def _obstacle_to_capture(device: wp.Device) -> str | None:

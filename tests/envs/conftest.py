@@ -21,6 +21,7 @@ class Drill:
         self.scene = build_scene(
             self.robot, timestep=0.005, solver_iterations=10, max_delay=3, library=library
         )
+        self.scene.model.opt.tolerance = 1e-8  # backends agree where their solvers converge
         frames = [torch.tensor(k.qpos) for k in self.robot.keyframes[:WORLDS]]
         self.qpos = torch.stack(frames).float()
         self.hold = self.qpos[:, 7:].clone()

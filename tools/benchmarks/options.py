@@ -183,7 +183,8 @@ def _variants(chosen: Options, step_dt: float) -> dict[str, Options]:
     k = chosen.substeps
     changes: list[dict[str, Any]] = [
         *({"cone": cone} for cone in ("pyramidal", "elliptic")),
-        *({"iterations": count} for count in (4, 6, 10, 20)),
+        *({"iterations": count} for count in (2, 3, 4, 6, 10, 20)),
+        *({"tolerance": tolerance} for tolerance in (1e-8, 1e-6, 1e-5, 1e-4)),
         *({"ls_iterations": count} for count in (4, 6, 10, 20)),
         *({"condim": dimensions} for dimensions in (3, 4, 6)),
         *({"substeps": count} for count in (k, k + 1, 2 * k)),

@@ -4,35 +4,37 @@ from __future__ import annotations
 
 from statistics import median
 
+import torch
 from rich.table import Table
 
-from kiras_rl.envs import make_env
+from kiras_rl.envs import make_env, resolve_backend
 from kiras_rl.process import single_threaded
-from kiras_rl.tools.benchmarks.request import Figures, Request, native
+from kiras_rl.tools.benchmarks.request import Figures, Request
 from kiras_rl.tools.benchmarks.tables import make_table, verdict, with_range
 from kiras_rl.tools.benchmarks.workload import ENVIRONMENT_PARTS, Workload
 from kiras_rl.tools.timing import PartTimer, Times, interleave, ratios, summarise
 
-BARE, NO_SENSORS = "mujoco.batch", "batch without sensors"
-SIMULATION, ENVIRONMENT = "NativeSimulation.step", "environment step"
-TARGET = 0.8  # of bare mujoco.batch
+BARE = {"native": "mujoco.batch", "warp": "mujoco_warp"}
+NO_SENSORS, SIMULATION, ENVIRONMENT = "without sensors", "simulation step", "environment step"
+TARGET = {"native": 0.8, "warp": 0.9}  # of the bare library's speed
 
 
 def measure(request: Request) -> Figures:
     """Time the environment and what it is built on, with torch on one thread as in a rollout.
 
-    Always the native backend on the CPU: that is what is compared.
-
     Raises:
         ConfigError: As `make_env`.
         RobotError: As `make_env`.
     """
-    config, rounds = native(request.config), request.rounds
-    with single_threaded("cpu"):
-        work = Workload(make_env(config), config.sim, config.learner.ppo.num_steps, config.seed)
+    config, rounds, device = request.config, request.rounds, request.device
+    backend = resolve_backend(config.sim.backend, torch.device(device))
+    bare = BARE[backend]
+    with single_threaded(device):
+        env = make_env(config, device)
+        work = Workload(env, config.sim, config.learner.ppo.num_steps, config.seed)
         variants = {
-            BARE: work.bare(),
-            NO_SENSORS: work.bare(sensors=False),
+            bare: work.bare(),
+            f"{bare} {NO_SENSORS}": work.bare(sensors=False),
             SIMULATION: work.simulation(),
             ENVIRONMENT: work.environment(),
         }
@@ -40,10 +42,11 @@ def measure(request: Request) -> Figures:
         parts, resets = _measure_parts(work, rounds), _share_of_resets(work)
     return {
         "worlds": config.num_envs,
+        "device": device,
         "seconds_per_step": {name: summarise(times) for name, times in steps.items()},
         "steps_per_second": {n: config.num_envs / median(times) for n, times in steps.items()},
-        "share_of_bare_speed": {n: summarise(ratios(steps, BARE, n)) for n in steps},
-        "target": TARGET,
+        "share_of_bare_speed": {n: summarise(ratios(steps, bare, n)) for n in steps},
+        "target": TARGET[backend],
         "share_of_worlds_reset": resets,
         "parts_seconds": {part: median(times) for part, times in parts.items()},
         "rounds": {"steps": steps, "parts": parts},
@@ -55,7 +58,7 @@ def _measure_parts(work: Workload, rounds: int) -> Times:
 
     A part that no step ran is left out.
     """
-    timer = PartTimer()
+    timer = PartTimer(work.env.device)
     timer.wrap_all(work.env, ENVIRONMENT_PARTS)
     parts: Times = {part: [] for part in timer.seconds}
     run = work.environment()
@@ -77,7 +80,8 @@ def _share_of_resets(work: Workload) -> float:
 def table(figures: Figures) -> list[Table]:
     """Return the comparison, and the parts of a step."""
     columns = ("ms", "env steps/s", "of bare speed", "range")
-    speeds = make_table(f"control steps of {figures['worlds']} worlds", *columns)
+    title = f"control steps of {figures['worlds']} worlds on {figures['device']}"
+    speeds = make_table(title, *columns)
     for name, seconds in figures["seconds_per_step"].items():
         ms, rate = f"{1e3 * seconds['median']:.2f}", f"{figures['steps_per_second'][name]:,.0f}"
         speeds.add_row(name, ms, rate, *with_range(figures["share_of_bare_speed"][name]))

@@ -43,6 +43,8 @@ WITHOUT_SCAN = "without height_scan"
 def measure(request: Request) -> Figures:
     """Time environments of many sizes, then of one size with more and less in them.
 
+    Where sizes are asked for, nothing but these is measured.
+
     Raises:
         ConfigError: As `make_env`.
         RobotError: As `make_env`.
@@ -59,6 +61,7 @@ def measure(request: Request) -> Figures:
         "variants": {
             name: _alone(config, request, skills)
             for name, (config, skills) in _variants(request.config).items()
+            if not request.sizes
         },
     }
 
@@ -182,6 +185,8 @@ def table(figures: Figures) -> list[Table]:
         before = figures["sizes"][index - 1] if index else None
         sizes.add_row(f"{size['worlds']:,} worlds", *_row(size), _memory_of_a_world(size, before))
     sizes.caption = f"stopped: {figures['stopped']}" if figures["stopped"] else None
+    if not figures["variants"]:
+        return [sizes]
     variants = make_table(f"{figures['worlds']:,} worlds: {where}", *columns[:-1], "times flat")
     flat = figures["variants"][FLAT]["seconds_per_step"]
     for name, size in figures["variants"].items():

@@ -13,6 +13,7 @@ from mujoco.batch import Batch
 
 from kiras_rl.envs.quadruped import QuadrupedEnv
 from kiras_rl.envs.simulation.base import RANDOMISED_FIELDS
+from kiras_rl.envs.simulation.native import NativeSimulation
 from kiras_rl.schema import SimConfig
 from kiras_rl.tools.timing import wait_for
 
@@ -59,8 +60,9 @@ class Workload:
         return hold + ACTION_NOISE * noise
 
     def bare(self, sensors: bool = True) -> Callable[[], float]:
-        """Return a run of `mujoco.batch` alone."""
-        return bare_steps(self.env, self.state, self.targets, self._sim, sensors)
+        """Return a run of the library behind the environment alone."""
+        steps = bare_steps if isinstance(self.env.sim, NativeSimulation) else bare_warp_steps
+        return steps(self.env, self.state, self.targets, self._sim, sensors)
 
     def simulation(self) -> Callable[[], float]:
         """Return a run of the simulation behind the environment."""
@@ -121,6 +123,61 @@ def bare_steps(
     def step(index: int) -> None:
         ctrl[:] = arrays[index]
         batch.step(nstep=sim.substeps)
+
+    return timed_steps(restore, step, len(targets), env.device)
+
+
+def bare_warp_steps(
+    env: QuadrupedEnv,
+    state: dict,
+    targets: list[torch.Tensor],
+    sim: SimConfig,
+    sensors: bool = True,
+) -> Callable[[], float]:
+    """Return a run of `mujoco_warp` alone, as its documentation has it: steps in one graph.
+
+    The same model, contact sensors of MuJoCo's own included, its worlds' fields, and no terrain;
+    arguments as those of `bare_steps`.
+    """
+    import mujoco_warp as mjw
+    import warp as wp
+
+    from kiras_rl.envs.simulation.warp import on_stream_of_torch
+
+    device = wp.get_device(str(env.device))
+    model = copy.copy(env.sim.model)
+    if not sensors:
+        model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_SENSOR)
+    with wp.ScopedDevice(device):
+        n = env.num_envs
+        m = mjw.put_model(model, batch_sizes=dict.fromkeys(RANDOMISED_FIELDS, n))
+        m.opt.warn_overflow = 0
+        memory = {"nconmax": sim.max_contacts, "njmax": sim.max_constraints}
+        data = mjw.make_data(model, n, **memory)
+        begin = {name: state["sim"][name] for name in ("qpos", "qvel", "ctrl", "qacc_warmstart")}
+        if "history" in state["sim"]:
+            begin["history"] = state["sim"]["history"].flatten(1)
+        bound = {name: wp.to_torch(getattr(data, name)) for name in begin}
+        for name in RANDOMISED_FIELDS:
+            wp.to_torch(getattr(m, name)).copy_(state["sim"][f"field/{name}"])
+
+        def launch() -> None:
+            for _ in range(sim.substeps):
+                mjw.step(m, data)
+
+        launch()
+        with wp.ScopedCapture() as recording:
+            launch()
+    wait_for(env.device)
+
+    def restore() -> None:
+        for name, values in begin.items():
+            bound[name].copy_(values)
+
+    def step(index: int) -> None:
+        bound["ctrl"].copy_(targets[index])
+        with on_stream_of_torch(device):
+            wp.capture_launch(recording.graph)
 
     return timed_steps(restore, step, len(targets), env.device)
 
