@@ -225,7 +225,7 @@ class WarpSimulation:
             capture = False
         _log.info("Preparing the kernels of MuJoCo-Warp: minutes the first time, seconds later")
         initial = self.state_dict()
-        self._control_step = _Launches(self._launch_control_step, self._warp_device, capture)
+        self._control_step = Launches(self._launch_control_step, self._warp_device, capture)
         self.load_state_dict(initial)
         self.sensor_record.zero_()
 
@@ -312,7 +312,7 @@ class WarpSimulation:
         self._overflow.zero_()
 
 
-class _Launches:
+class Launches:
     """A fixed sequence of kernel launches, on the stream that torch uses at the call."""
 
     def __init__(self, launch: Callable[[], None], device: wp.Device, capture: bool) -> None:
@@ -327,19 +327,17 @@ class _Launches:
             self._graph = recording.graph
 
     def __call__(self) -> None:
-        with on_stream_of_torch(self._device):
+        with self._scope():
             if self._graph is None:
                 self._launch()
             else:
                 wp.capture_launch(self._graph)
 
-
-def on_stream_of_torch(device: wp.Device) -> contextlib.AbstractContextManager:
-    """Let Warp launch on a device where torch launches now: neither waits for the other."""
-    if device.is_cpu:
-        return wp.ScopedDevice(device)
-    stream = torch.cuda.current_stream(wp.device_to_torch(device))
-    return wp.ScopedStream(_warp_stream(stream), sync_enter=False)
+    def _scope(self) -> contextlib.AbstractContextManager:
+        if self._device.is_cpu:
+            return wp.ScopedDevice(self._device)
+        stream = torch.cuda.current_stream(wp.device_to_torch(self._device))
+        return wp.ScopedStream(_warp_stream(stream), sync_enter=False)
 
 
 _warp_stream = functools.lru_cache(maxsize=None)(wp.stream_from_torch)

@@ -142,7 +142,7 @@ def bare_warp_steps(
     import mujoco_warp as mjw
     import warp as wp
 
-    from kiras_rl.envs.simulation.warp import on_stream_of_torch
+    from kiras_rl.envs.simulation.warp import Launches
 
     device = wp.get_device(str(env.device))
     model = copy.copy(env.sim.model)
@@ -161,14 +161,12 @@ def bare_warp_steps(
         for name in RANDOMISED_FIELDS:
             wp.to_torch(getattr(m, name)).copy_(state["sim"][f"field/{name}"])
 
-        def launch() -> None:
-            for _ in range(sim.substeps):
-                mjw.step(m, data)
+    def launch() -> None:
+        for _ in range(sim.substeps):
+            mjw.step(m, data)
 
-        launch()
-        with wp.ScopedCapture() as recording:
-            launch()
-    wait_for(env.device)
+    wp.synchronize_device(device)  # torch continues on a stream of its own
+    control_step = Launches(launch, device, capture=True)
 
     def restore() -> None:
         for name, values in begin.items():
@@ -176,8 +174,7 @@ def bare_warp_steps(
 
     def step(index: int) -> None:
         bound["ctrl"].copy_(targets[index])
-        with on_stream_of_torch(device):
-            wp.capture_launch(recording.graph)
+        control_step()
 
     return timed_steps(restore, step, len(targets), env.device)
 
