@@ -327,6 +327,7 @@ class Launches:
             self._graph = recording.graph
 
     def __call__(self) -> None:
+        """Launch, without waiting."""
         with self._scope():
             if self._graph is None:
                 self._launch()

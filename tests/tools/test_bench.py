@@ -11,10 +11,12 @@ from types import SimpleNamespace
 import pytest
 import torch
 
+from kiras_rl.config import load_config
 from kiras_rl.robots.robot import load_robot
 from kiras_rl.tools import timing
 from kiras_rl.tools.bench import main
 from kiras_rl.tools.benchmarks import scale
+from kiras_rl.tools.benchmarks.request import Request
 
 SMALL = (
     *("--worlds=16", "--rounds=1", "learner.ppo.num_steps=4", "learner.ppo.num_mini_batches=2"),
@@ -188,6 +190,17 @@ def test_worlds_are_added_until_memory_is_short(bench, tmp_path):
     for size in measured["sizes"]:
         assert size["steps_per_second"] == pytest.approx(size["worlds"] / size["seconds_per_step"])
         assert size["memory_bytes"] > 0
+    assert measured["variants"] == {}  # nothing but what was asked for
+    assert (tmp_path / "scale.png").read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.slow
+def test_what_is_in_the_worlds_is_varied(monkeypatch):
+    monkeypatch.setattr(scale, "FIRST", 4)
+    monkeypatch.setattr(scale, "LARGEST", {"cpu": 8})
+    config = load_config("solo8", ["num_envs=4", "finetuning=null", "sim.backend=native"])
+    measured = scale.measure(Request(config, rounds=1, device="cpu"))
+    assert [size["worlds"] for size in measured["sizes"]] == [4, 8]
     skills = {name: variant["skills"] for name, variant in measured["variants"].items()}
     assert skills == {
         "flat ground": 5,
@@ -196,7 +209,6 @@ def test_worlds_are_added_until_memory_is_short(bench, tmp_path):
         "flat ground, 5 skills": 5,
         "flat ground, 10 skills": 10,
     }
-    assert (tmp_path / "scale.png").read_bytes().startswith(b"\x89PNG")
 
 
 def test_more_skills_than_a_robot_has_are_its_own_again():

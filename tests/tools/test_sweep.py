@@ -222,7 +222,7 @@ def test_an_unknown_sweep_is_refused(capsys):
 
 
 def test_the_shipped_sweep_compares_the_ablations_at_one_budget(tmp_path):
-    assert list_sweeps() == ["ablations"]
+    assert list_sweeps() == ["ablations", "efficiency"]
     runs = load_sweep("ablations", [], tmp_path)
     ablations = [name for name in list_configs() if name.startswith("ablations/")]
     labels = {"kiras", *(name.removeprefix("ablations/") for name in ablations)}
@@ -231,10 +231,20 @@ def test_the_shipped_sweep_compares_the_ablations_at_one_budget(tmp_path):
     assert [run.config.seed for run in runs] == 5 * [1] + 5 * [2]
     for run in runs:
         config = run.config
-        assert config.num_envs * config.learner.ppo.num_steps * config.iterations == 10_027_008
+        assert config.num_envs * config.learner.ppo.num_steps * config.iterations == 6_389_760
         assert config.finetuning is None
         assert run.folder == tmp_path / "sweeps" / "ablations" / run.label / f"seed_{config.seed}"
         assert (config.learner.imitation is None) == (run.label == "no_sil")
         assert (config.learner.multi_critic is None) == (run.label == "no_muc")
         assert (config.learner.estimator is None) == (run.label == "no_ece")
         assert (config.learner.skill_init is None) == (run.label == "no_skill_init")
+
+
+def test_the_sweep_of_efficiency_uses_the_same_steps_in_other_ways(tmp_path):
+    runs = load_sweep("efficiency", [], tmp_path)
+    assert len(runs) == 4
+    for run in runs:
+        config = run.config
+        assert config.num_envs * config.learner.ppo.num_steps * config.iterations == 4_915_200
+    learners = [run.config.learner for run in runs]
+    assert all(learners.count(learner) == 1 for learner in learners)
