@@ -17,8 +17,6 @@ from typing import TypeVar
 import torch
 from torch.utils._pytree import tree_flatten, tree_unflatten
 
-from kiras_rl import distributed
-
 _log = logging.getLogger(__name__)
 
 T = TypeVar("T")
@@ -37,7 +35,7 @@ class Recorded:
         carried: Callable[[], Iterable[Slot]] = tuple,
         renewed: Iterable[object] = (),
         variant: Callable[[], Hashable] = tuple,
-        communicates: bool = False,
+        enabled: bool = True,
         compiled: bool = False,
     ) -> None:
         """Take the function; nothing is called yet.
@@ -50,13 +48,12 @@ class Recorded:
                 between two calls, by tensors of the same shape; no other that it reads may.
             renewed: Objects whose attributes it only replaces, with what others read later.
             variant: What else decides which operations run; a new value is a new recording.
-            communicates: Whether ranks wait for each other in it; then several are not recorded.
+            enabled: False for a function that cannot be recorded: ranks wait for each other in it.
             compiled: Whether torch.compile fuses its operations first, which takes half a minute.
         """
         self._plain, self._carried, self._variant = function, carried, variant
         self._renewed = tuple(renewed)
-        alone = distributed.size() == 1 or not communicates
-        self.records = alone and torch.device(device).type == "cuda"
+        self.records = enabled and torch.device(device).type == "cuda"
         self._function = function
         if self.records and compiled:
             self._function = torch.compile(function, fullgraph=True, dynamic=False)

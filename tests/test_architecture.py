@@ -31,6 +31,7 @@ SIMULATION = Rule(
             "kiras_rl.envs",
             "kiras_rl.robots",
             "kiras_rl.interfaces",
+            "kiras_rl.recorded",
             "kiras_rl.config",
             "kiras_rl.schema",
         ),
@@ -42,6 +43,7 @@ RULES = {  # the longest name that fits a module counts
     "kiras_rl.config": LEARNING._replace(may=(*LEARNING.may, "omegaconf")),
     "kiras_rl.evaluation.dtw": LEARNING._replace(may=(*LEARNING.may, "dtaidistance")),
     "kiras_rl.export": LEARNING._replace(may=(*LEARNING.may, "onnxruntime")),  # the parity check
+    "kiras_rl.recorded": Rule(("torch",)),
     "kiras_rl.dataset": Rule(("numpy", "kiras_rl.lerobot")),
     "kiras_rl.lerobot": Rule(("numpy", "pyarrow", "kiras_rl.dataset")),
     "kiras_rl.deploy": Rule(("numpy", "onnxruntime", "kiras_rl.deploy")),

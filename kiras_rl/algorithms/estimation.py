@@ -46,7 +46,10 @@ class Estimation:
         self._data: dict[str, torch.Tensor] = {}
         self._num_mini_batches = 1
         self._epoch = Recorded(
-            self._train_epoch, device, variant=lambda: self._num_mini_batches, communicates=True
+            self._train_epoch,
+            device,
+            variant=lambda: self._num_mini_batches,
+            enabled=distributed.size() == 1,
         )
         self.adaboot = AdaBoot(config.adaboot, config.adaboot_floor, num_envs, device)
 

@@ -66,7 +66,7 @@ class KirasPPO(PPO):
         parameters = chain(parts.actor.parameters(), parts.critic.parameters())
         self.optimizer = make_adam(parameters, self.learning_rate, device)
         self._data: dict[str, torch.Tensor] = {}
-        self._epoch = Recorded(self._train_epoch, device, communicates=True)
+        self._epoch = Recorded(self._train_epoch, device, enabled=distributed.size() == 1)
         self.config = config
         self.iterations = iterations
         self.iteration = 0

@@ -59,7 +59,9 @@ class SelfImitation:
         self._skill = torch.zeros(num_steps * num_envs, dtype=torch.int64, device=device)
         self._rewards = torch.zeros(num_steps, num_envs, device=device)
         self._step = 0
-        self._train = Recorded(self._train_step, device, carried=self._carried, communicates=True)
+        self._train = Recorded(
+            self._train_step, device, carried=self._carried, enabled=distributed.size() == 1
+        )
 
     def _carried(self) -> list[tuple[object, str]]:
         """Return what a training step reads and others replace; see `Recorded`."""
