@@ -242,9 +242,9 @@ def test_the_shipped_sweep_compares_the_ablations_at_one_budget(tmp_path):
 
 def test_the_sweep_of_efficiency_uses_the_same_steps_in_other_ways(tmp_path):
     runs = load_sweep("efficiency", [], tmp_path)
-    assert len(runs) == 4
+    assert len(runs) == 3
     for run in runs:
         config = run.config
-        assert config.num_envs * config.learner.ppo.num_steps * config.iterations == 4_915_200
+        assert config.num_envs * config.learner.ppo.num_steps * config.iterations == 6_881_280
     learners = [run.config.learner for run in runs]
     assert all(learners.count(learner) == 1 for learner in learners)
