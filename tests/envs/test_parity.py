@@ -169,19 +169,19 @@ def environments():
 def test_environments_agree(environments):
     native, warp = environments
     compare_observations(native.get_observations(), warp.get_observations())
-    generator = torch.Generator().manual_seed(2)
-    resets, apart = torch.zeros(4), torch.zeros(())
+    # In other sequences a force may lie at the threshold of contact, on either side of it.
+    generator = torch.Generator().manual_seed(4)
+    resets = torch.zeros(4)
     for _ in range(25):
         actions = 2 * torch.rand(4, native.num_actions, generator=generator) - 1
         results = [env.step(actions) for env in environments]
         (obs_a, rewards_a, dones_a, extras_a), (obs_b, rewards_b, dones_b, extras_b) = results
         compare_observations(obs_a, obs_b)
-        apart += ((rewards_b - rewards_a).abs() > 1e-4).sum()
+        assert_near(rewards_b, rewards_a, 1e-4, "rewards")
         assert (dones_a == dones_b).all()
         assert (extras_a["time_outs"] == extras_b["time_outs"]).all()
         resets += dones_a
     assert (resets >= 2).all()
-    assert apart <= 1  # of 100: a force near the threshold of contact may be on either side
     assert native.sim.diverged.sum() == warp.sim.overflowed.sum() == 0
 
 

@@ -17,12 +17,11 @@ def sim(request, simulations):
 @pytest.fixture
 def assert_same_motion(sim):
     """Compare what `Drill.run` returned: bit for bit on a CPU; a GPU adds up in any order."""
-    exact = sim.device.type == "cpu"
+    atol = 1e-3 if sim.device.type == "cuda" else 0.0
 
     def check(a, b, worlds=ALL):
         for name in a:
             x, y = a[name][:, worlds], b[name][:, worlds]
-            atol = 0.0 if exact else 0.05 if name == "record" else 1e-3  # forces of up to 40 N
             torch.testing.assert_close(x, y, rtol=0, atol=atol, msg=name)
 
     return check
