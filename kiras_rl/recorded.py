@@ -120,10 +120,11 @@ class _Recording:
 def _bind(slots: list[tuple[Slot, torch.Tensor]]) -> None:
     """Bring what was replaced, from outside or by the function, to where it is read."""
     current = [(attrgetter(slot[1])(slot[0]), slot, tensor) for slot, tensor in slots]
+    replaced = [(value, slot, tensor) for value, slot, tensor in current if value is not tensor]
     # Copies first: one value may be what another one overwrites, or a view of it.
-    new = [(value.clone(), *where) for value, *where in current if value is not where[1]]
-    for value, slot, tensor in new:
-        tensor.copy_(value)
+    values = _copies([value for value, _, _ in replaced])
+    _copy_all([tensor for _, _, tensor in replaced], values)
+    for _, slot, tensor in replaced:
         _set(slot, tensor)
 
 
@@ -158,7 +159,11 @@ def copied(tree: T) -> T:
 def _copies(tensors: list[torch.Tensor]) -> list[torch.Tensor]:
     """Return copies; those of numbers by few kernels for all."""
     copies = [torch.empty_like(tensor) for tensor in tensors]
-    for dtype in {tensor.dtype for tensor in tensors}:
-        group = [i for i, tensor in enumerate(tensors) if tensor.dtype == dtype]
-        torch._foreach_copy_([copies[i] for i in group], [tensors[i] for i in group])
+    _copy_all(copies, tensors)
     return copies
+
+
+def _copy_all(targets: list[torch.Tensor], values: list[torch.Tensor]) -> None:
+    for dtype in {value.dtype for value in values}:
+        group = [i for i, value in enumerate(values) if value.dtype == dtype]
+        torch._foreach_copy_([targets[i] for i in group], [values[i] for i in group])

@@ -68,9 +68,10 @@ def collect(phase: str) -> dict:
     if alg.imitation:
         alg.imitation._valid[:] = world % 3 > 0
     return {
-        "storage": {k: v.clone() for k, v in vars(st).items() if isinstance(v, torch.Tensor)},
+        "storage": {
+            k: v.clone() for k, v in vars(st).items() if isinstance(v, torch.Tensor) and v.dim() > 1
+        },
         "observations": st.observations.clone(),
-        "distribution": st.distribution_params,
         "last": runner.env.get_observations(),
         "imitation": _pairs(alg) if alg.imitation else {},
     }
@@ -87,7 +88,6 @@ def gradients(phase: str, rollout: dict, worlds: slice) -> dict[str, torch.Tenso
     for name, value in rollout["storage"].items():
         setattr(alg.storage, name, value[mine].clone())
     alg.storage.observations = rollout["observations"][mine].clone()
-    alg.storage.distribution_params = tuple(x[mine] for x in rollout["distribution"])
     for name, value in rollout["imitation"].items():
         setattr(alg.imitation, name, value[mine].clone())
     with torch.no_grad():

@@ -37,13 +37,13 @@ class AdaBoot:
         self.uses_estimate = torch.ones(num_envs, dtype=torch.bool, device=device)
 
     def record(self, reward: torch.Tensor, done: torch.Tensor) -> None:
-        """Add a step's rewards (N,) and dones (N,)."""
+        """Add a step's rewards (N,) and dones (N,); in place, as a recorded step has to."""
         self._running += reward
         self._length += 1
         ended = done > 0
-        self._last = torch.where(ended, self._running / self._length, self._last)
-        self._running = torch.where(ended, 0.0, self._running)
-        self._length = torch.where(ended, 0.0, self._length)
+        self._last.copy_(torch.where(ended, self._running / self._length, self._last))
+        self._running.masked_fill_(ended, 0.0)
+        self._length.masked_fill_(ended, 0.0)
 
     def renew(self) -> None:
         """Once an iteration: renew p, and which worlds' actors see the estimate."""
@@ -55,7 +55,7 @@ class AdaBoot:
             self.probability = trust(known)
         if self.bootstraps_input:
             draws = torch.rand(len(self._last), device=self._last.device)
-            self.uses_estimate = draws < self.probability
+            self.uses_estimate.copy_(draws < self.probability)
 
     def update_allowed(self) -> bool:
         """Draw whether the estimator may be trained in this iteration, on all ranks or on none."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import torch
 from tensordict import TensorDict
 
@@ -72,7 +74,7 @@ class Estimation:
         return cls(config, estimator, len(obs), device)
 
     @torch.no_grad()
-    def context(self, obs: TensorDict) -> torch.Tensor:
+    def context(self, obs: Mapping[str, torch.Tensor]) -> torch.Tensor:
         """Return the actor's context, (N, 3 + Z).
 
         With AdaBoot on the input, worlds that do not trust the estimate are told the true velocity.

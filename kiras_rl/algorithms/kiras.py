@@ -19,6 +19,7 @@ from kiras_rl.algorithms.adam import fit_adam, make_adam
 from kiras_rl.algorithms.estimation import Estimation
 from kiras_rl.algorithms.parts import Parts, build_parts
 from kiras_rl.algorithms.residual import Reference
+from kiras_rl.algorithms.rollout import Rollout
 from kiras_rl.algorithms.storage import GroupRolloutStorage, mini_batches
 from kiras_rl.imitation.premium import PremiumSelector
 from kiras_rl.imitation.self_imitation import SelfImitation
@@ -67,6 +68,7 @@ class KirasPPO(PPO):
         self.optimizer = make_adam(parameters, self.learning_rate, device)
         self._data: dict[str, torch.Tensor] = {}
         self._epoch = Recorded(self._train_epoch, device, enabled=distributed.size() == 1)
+        self._rollout = Rollout(parts, device)
         self.config = config
         self.iterations = iterations
         self.iteration = 0
@@ -81,20 +83,12 @@ class KirasPPO(PPO):
 
     # --- rollout --------------------------------------------------------------------------------
 
-    @torch.no_grad()
     def act(self, obs: TensorDict) -> torch.Tensor:
-        """Sample actions (N, J); the context is computed once, here, and stored with the step.
+        """Sample actions (N, J).
 
         Values are not needed before the rollout is over: `compute_returns` asks the critics once.
         """
-        if self.estimation:
-            obs[names.CONTEXT] = self.estimation.context(obs)
-        step, actor = self.transition, self.actor
-        step.observations = obs
-        step.actions = actor(obs, stochastic_output=True)
-        step.actions_log_prob = actor.get_output_log_prob(step.actions)
-        step.distribution_params = actor.output_distribution_params
-        return step.actions
+        return self._rollout.act(obs)
 
     def act_deterministic(self, obs: TensorDict) -> torch.Tensor:
         """Return mean actions (N, J) as the exported policy computes them."""
@@ -109,7 +103,7 @@ class KirasPPO(PPO):
     def process_env_step(
         self, obs: TensorDict, rewards: torch.Tensor, dones: torch.Tensor, extras: dict
     ) -> None:
-        """Record one environment step.
+        """Store one environment step.
 
         Args:
             obs: Observation after the step; not used, what counts is in extras.
@@ -117,20 +111,7 @@ class KirasPPO(PPO):
             dones: Ended episodes, (N,).
             extras: See kiras_rl.interfaces.
         """
-        step = self.transition
-        before = step.observations
-        before[names.NEXT_PROPRIO] = extras[names.NEXT_PROPRIO]
-        step.rewards = rewards
-        if self.reference:
-            is_flat = extras[names.EXTRA_FLAT]
-            step.rewards = rewards + self.reference.record(before, step.actions, is_flat)
-        step.dones, step.time_outs = dones, extras[names.EXTRA_TIME_OUTS]
-        if self.imitation:
-            self.imitation.record(before, rewards, dones, extras)
-        if self.estimation:
-            self.estimation.record(rewards, dones)
-        self.storage.add_transition(step)
-        step.clear()
+        self._rollout.store(rewards, dones, extras)
 
     @torch.no_grad()
     def compute_returns(self, obs: TensorDict) -> None:
@@ -187,7 +168,6 @@ class KirasPPO(PPO):
 
     def _update_policy(self) -> dict[str, float]:
         st = self.storage
-        mean, std = st.distribution_params
         tensors = {
             "actor_obs": self.actor.get_latent(st.observations),
             "critic_obs": st.observations[names.CRITIC],
@@ -195,8 +175,8 @@ class KirasPPO(PPO):
             "old_log_prob": st.actions_log_prob,
             "advantages": st.advantages,
             "returns": st.returns,
-            "mean": mean,
-            "std": std,
+            "mean": st.action_mean,
+            "std": st.action_std,
         }
         if self.reference:
             tensors |= {key: st.observations[key] for key in (names.FLAT_ACTION, names.IS_FLAT)}
@@ -293,7 +273,7 @@ class KirasPPO(PPO):
         """Return how far the mean actions are from those of the flat policy."""
         st = self.storage
         flat, is_flat = (st.observations[key] for key in (names.FLAT_ACTION, names.IS_FLAT))
-        distance = torch.linalg.vector_norm(st.distribution_params[0] - flat, dim=-1)
+        distance = torch.linalg.vector_norm(st.action_mean - flat, dim=-1)
         weight = is_flat.squeeze(-1).float()
         on_flat = (distance * weight).sum() / weight.sum().clamp(min=1.0)
         return {
@@ -358,6 +338,7 @@ class KirasPPO(PPO):
         self.learning_rate = rate
         fit_adam(self.optimizer, [rate], self.device)
         self._epoch.forget()
+        self._rollout.forget()
         self.iteration = loaded_dict["iteration"]
         self.learning_rate.fill_(loaded_dict["learning_rate"])
         for name, part in self._parts().items():
@@ -376,6 +357,7 @@ class KirasPPO(PPO):
         recorders = self._recorders()
         for name, values in state.items():
             recorders[name].load_state_dict(values)
+        self._rollout.forget()
 
     def broadcast_parameters(self) -> None:
         """Take the networks of rank 0."""

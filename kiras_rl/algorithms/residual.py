@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import copy
+from collections.abc import Mapping
 
 import torch
-from tensordict import TensorDict
 
 from kiras_rl import interfaces as names
 from kiras_rl.models.exported import ExportedPolicy
@@ -37,17 +37,17 @@ class Reference:
         self._reward_weight = config.residual_weight * reward_scale
 
     @torch.no_grad()
-    def record(self, obs: TensorDict, action: torch.Tensor, is_flat: torch.Tensor) -> torch.Tensor:
-        """Write what the loss needs into `obs`; return the residual reward of a step, (N,).
+    def judge(
+        self, obs: Mapping[str, torch.Tensor], action: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return what the flat policy would have done, (N, J), and the residual reward, (N,).
 
         Args:
             obs: What the actor saw.
             action: What was done, (N, J).
-            is_flat: Worlds whose ground is flat, (N,) bool.
         """
         flat, _ = self.policy(obs[names.PROPRIO], obs[names.HISTORY])
-        obs[names.FLAT_ACTION], obs[names.IS_FLAT] = flat, is_flat.unsqueeze(1)
-        return -self._reward_weight * torch.linalg.vector_norm(action - flat, dim=-1)
+        return flat, -self._reward_weight * torch.linalg.vector_norm(action - flat, dim=-1)
 
     def state_dict(self) -> dict:
         """Return the frozen weights."""

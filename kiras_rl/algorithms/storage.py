@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 
 import torch
 from rsl_rl.storage import RolloutStorage
@@ -14,6 +14,9 @@ class GroupRolloutStorage(RolloutStorage):
 
     A step brings its task reward alone. The learner judges whole rollouts, for one pass over all
     steps costs less than one a step: it then sets `rewards`, `values`, `returns`, (T, N, G).
+
+    A step is written in two halves, what was seen and done and what came of it. `claim_row` says on
+    the host that one comes, `write` and `next_row` work on the device.
     """
 
     def __init__(
@@ -33,33 +36,46 @@ class GroupRolloutStorage(RolloutStorage):
         self.rewards = torch.zeros(*shape, num_groups, device=device)
         self.values = torch.zeros(*shape, num_groups, device=device)
         self.returns = torch.zeros(*shape, num_groups, device=device)
+        self.action_mean = torch.zeros(*shape, num_actions, device=device)
+        self.action_std = torch.zeros(*shape, num_actions, device=device)
+        # On the device, so that a recorded step finds its row
+        self._row = torch.zeros(1, dtype=torch.int64, device=device)
 
-    def add_transition(self, transition: RolloutStorage.Transition) -> None:
-        """Add one step.
+    def claim_row(self) -> None:
+        """Count a step that is about to be written, on the host: graphs write on the device alone.
 
-        Args:
-            transition: `rewards` (N,) are of the task; `time_outs` (N,) tells which `dones` (N,)
-                are of the clock.
+        Raises:
+            OverflowError: The rollout is full.
         """
         if self.step >= self.num_transitions_per_env:
             raise OverflowError("the rollout is full: clear() the storage before adding to it")
-        step = self.step
-        self.observations[step].copy_(transition.observations)
-        self.actions[step] = transition.actions
-        self.task_rewards[step] = transition.rewards.view(-1, 1)
-        self.dones[step] = transition.dones.view(-1, 1)
-        self.time_outs[step] = transition.time_outs.view(-1, 1)
-        self.actions_log_prob[step] = transition.actions_log_prob.view(-1, 1)
-        if self.distribution_params is None:
-            self.distribution_params = tuple(
-                torch.zeros(self.num_transitions_per_env, *p.shape, device=self.device)
-                for p in transition.distribution_params
-            )
-        for stored, new in zip(
-            self.distribution_params, transition.distribution_params, strict=True
-        ):
-            stored[step] = new
         self.step += 1
+
+    def write(self, observations: Mapping[str, torch.Tensor], **columns: torch.Tensor) -> None:
+        """Write some of the current row.
+
+        Args:
+            observations: Groups, (N, ...).
+            columns: Other buffers, by their names, (N,) or (N, k).
+        """
+        for name, value in observations.items():
+            self.write_row(self.observations[name], value)
+        for name, value in columns.items():
+            self.write_row(getattr(self, name), value)
+
+    def write_row(self, buffer: torch.Tensor, value: torch.Tensor) -> None:
+        """Write the current row of any (T, N, ...) buffer."""
+        row = value.to(buffer.dtype).view(1, *buffer.shape[1:])
+        buffer.index_copy_(0, self._row, row)
+
+    def next_row(self) -> None:
+        """Go on to the next row, on the device."""
+        self._row += 1
+
+    def clear(self) -> None:
+        """Begin at the first row again."""
+        super().clear()
+        self._row.zero_()
 
     def shuffle_into(self, data: dict[str, torch.Tensor], **tensors: torch.Tensor) -> None:
         """Write (T, N, ...) tensors into `data`, flat and in one random order, (T * N, ...).

@@ -63,7 +63,7 @@ class PremiumSelector:
         device = keyframe_features.device
         # A window that ends early in a rollout must survive until the end of that rollout.
         self._frames = torch.zeros(num_envs, config.window + num_steps, features, device=device)
-        self._position = 0
+        self._position = torch.zeros((), dtype=torch.int64, device=device)
 
         def per_world(value: float, dtype: torch.dtype = torch.float32) -> torch.Tensor:
             return torch.full((num_envs,), value, dtype=dtype, device=device)
@@ -87,7 +87,7 @@ class PremiumSelector:
         done: torch.Tensor,
         valid: torch.Tensor,
     ) -> None:
-        """Add one step of every world.
+        """Add one step of every world; in place, as a recorded step has to.
 
         A window holds one skill of one undisturbed episode; a change of skill begins a new one.
 
@@ -100,9 +100,10 @@ class PremiumSelector:
             valid: Whether the step counts; a failure does not, (N,) bool.
         """
         frames, window = self._frames, self._config.window
-        frames[:, self._position % frames.shape[1]] = features
+        place = (self._position % frames.shape[1]).view(1)
+        frames.index_copy_(1, place, features.unsqueeze(1))
         self._restart(skill != self._skill)
-        self._skill = skill.clone()
+        self._skill.copy_(skill)
         self._age += 1
         self._reward += reward
         self._distance += torch.linalg.vector_norm(features - self._keyframes[skill], dim=-1)
@@ -120,14 +121,16 @@ class PremiumSelector:
             self._reward, self._distance, config.window, config.distance_weight
         )
         eligible = full & moving & near
-        self._completed_score = torch.where(eligible, score, self._completed_score)
-        self._completed_skill = torch.where(eligible, self._skill, self._completed_skill)
-        self._completed_at = torch.where(eligible, self._position, self._completed_at)
+        for completed, value in (
+            (self._completed_score, score),
+            (self._completed_skill, self._skill),
+            (self._completed_at, self._position),
+        ):
+            completed.copy_(torch.where(eligible, value, completed))
 
     def _restart(self, mask: torch.Tensor) -> None:
-        self._age = torch.where(mask, 0, self._age)
-        for name in ("_reward", "_distance", "_speed"):
-            setattr(self, name, torch.where(mask, 0.0, getattr(self, name)))
+        for running in (self._age, self._reward, self._distance, self._speed):
+            running.masked_fill_(mask, 0)
 
     def select(self, iteration: int) -> None:
         """Move the best windows of the last rollout, of all ranks, into the buffer of each."""
@@ -194,8 +197,7 @@ class PremiumSelector:
 
     def state_dict(self) -> dict:
         """Return recorder and buffer."""
-        state = {k: v for k, v in vars(self).items() if isinstance(v, torch.Tensor)}
-        return state | {"_position": self._position}
+        return {k: v for k, v in vars(self).items() if isinstance(v, torch.Tensor)}
 
     def world_state(self) -> dict:
         """Return the recorder, which belongs to the worlds of this rank."""
@@ -204,5 +206,4 @@ class PremiumSelector:
     def load_state_dict(self, state: dict) -> None:
         """Go on from a saved state, or from that of the recorder alone."""
         for name, value in state.items():
-            is_tensor = isinstance(value, torch.Tensor)
-            setattr(self, name, value.to(self.scores.device) if is_tensor else value)
+            setattr(self, name, torch.as_tensor(value, device=self.scores.device))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import torch
 from tensordict import TensorDict
 
@@ -58,7 +60,6 @@ class SelfImitation:
         self._valid = torch.zeros(num_steps, num_envs, dtype=torch.bool, device=device)
         self._skill = torch.zeros(num_steps * num_envs, dtype=torch.int64, device=device)
         self._rewards = torch.zeros(num_steps, num_envs, device=device)
-        self._step = 0
         self._train = Recorded(
             self._train_step, device, carried=self._carried, enabled=distributed.size() == 1
         )
@@ -90,17 +91,29 @@ class SelfImitation:
         )
 
     def record(
-        self, before: TensorDict, rewards: torch.Tensor, dones: torch.Tensor, extras: dict
+        self,
+        storage: GroupRolloutStorage,
+        before: Mapping[str, torch.Tensor],
+        after: torch.Tensor,
+        valid: torch.Tensor,
+        rewards: torch.Tensor,
+        dones: torch.Tensor,
+        time_outs: torch.Tensor,
     ) -> None:
-        """Store a step.
+        """Store a step; in place, as a recorded step has to.
 
-        Both halves of a pair come from one episode: the second is Phi before the reset.
+        Args:
+            storage: Knows which row of the rollout this is.
+            before: Observations before the step.
+            after: Phi after it and before a reset, (N, D): a pair is of one episode.
+            valid: Whether that is one undisturbed motion, (N,) bool.
+            rewards: Task reward, (N,).
+            dones: Ended episodes, (N,).
+            time_outs: Those that the clock ended, (N,) bool.
         """
-        after, valid = extras[names.EXTRA_IMITATION], extras[names.EXTRA_VALID]
-        torch.cat([before[names.IMITATION], after], dim=-1, out=self._pairs[self._step])
-        self._valid[self._step] = valid
-        self._step += 1
-        failed = dones.bool() & ~extras[names.EXTRA_TIME_OUTS]
+        storage.write_row(self._pairs, torch.cat([before[names.IMITATION], after], dim=-1))
+        storage.write_row(self._valid, valid)
+        failed = dones.bool() & ~time_outs
         self.selector.record(
             features=after,
             skill=before[names.SKILL].argmax(dim=-1),
@@ -128,7 +141,6 @@ class SelfImitation:
         self._noise_factor.fill_(piecewise_linear(self.config.discriminator.noise, progress))
         for _ in range(self.config.discriminator.updates):
             loss, expert, policy = self._train()
-        self._step = 0
         scalars |= {
             "Discriminator/loss": loss.item(),
             "Discriminator/expert": expert.mean().item(),

@@ -71,11 +71,9 @@ def test_the_residual_reward_is_the_distance_of_what_was_done(make_runner):
     mean = alg.policy()(obs["proprio"], obs["history"])[0].detach()
     reference = Reference(alg.policy(), RetentionConfig(0.15, 1.0), reward_scale=0.02)
     away = mean + torch.tensor([0.3, -0.4])  # 0.5 from the reference
-    is_flat = torch.arange(len(mean)) % 2 == 0
-    reward = reference.record(obs, away, is_flat)
+    flat, reward = reference.judge(obs, away)
     assert torch.allclose(reward, torch.tensor(-0.15 * 0.02 * 0.5), atol=1e-7)
-    assert torch.allclose(obs["flat_action"], mean)
-    assert torch.equal(obs["is_flat"][:, 0], is_flat)
+    assert torch.allclose(flat, mean)
 
 
 def test_the_loss_is_the_squared_distance_on_flat_ground():

@@ -181,9 +181,10 @@ def test_a_saved_learner_goes_on(make_runner):
 
 
 @pytest.mark.parametrize("phase", [SKILL_LEARNING, FINETUNING])
-def test_replayed_updates_are_the_same(make_runner, taped, phase):
+def test_replayed_rollouts_and_updates_are_the_same(make_runner, taped, phase):
     plain, replayed = (make_runner("learner.estimator.epochs=3", phase=phase) for _ in range(2))
-    recorded = [replayed.alg._epoch, replayed.alg.estimation._epoch]
+    recorded = [replayed.alg._rollout._act, replayed.alg._rollout._store]
+    recorded += [replayed.alg._epoch, replayed.alg.estimation._epoch]
     recorded += [replayed.alg.imitation._train] if replayed.alg.imitation else []
     for part in recorded:
         part.records = True

@@ -11,18 +11,17 @@ from kiras_rl.algorithms.storage import GroupRolloutStorage, mini_batches
 STEPS, WORLDS, ACTIONS = 3, 4, 2
 
 
-def step(value):
-    """Return a transition whose every number tells the step and the world."""
+def write(storage, value):
+    """Write a step whose every number tells the step and the world, in two halves."""
     number = value + torch.arange(WORLDS).float()[:, None] / 10
-    transition = GroupRolloutStorage.Transition()
-    transition.observations = TensorDict({"a": number}, batch_size=[WORLDS])
-    transition.actions = number.expand(-1, ACTIONS)
-    transition.rewards = number.squeeze(1)
-    transition.dones = number.squeeze(1) > 1.2
-    transition.time_outs = number.squeeze(1) > 2.2
-    transition.actions_log_prob = number.squeeze(1)
-    transition.distribution_params = (number.expand(-1, ACTIONS), torch.ones(WORLDS, ACTIONS))
-    return transition
+    storage.claim_row()
+    actions = number.expand(-1, ACTIONS)
+    storage.write(
+        {"a": number}, actions=actions, actions_log_prob=number.squeeze(1), action_mean=actions
+    )
+    one = number.squeeze(1)
+    storage.write({}, task_rewards=one, dones=one > 1.2, time_outs=one > 2.2)
+    storage.next_row()
 
 
 @pytest.fixture
@@ -33,23 +32,23 @@ def storage():
 
 def test_every_step_has_its_row(storage):
     for t in range(STEPS):
-        storage.add_transition(step(t))
+        write(storage, t)
     number = torch.arange(3.0)[:, None] + torch.arange(4.0) / 10
     torch.testing.assert_close(storage.task_rewards, number[..., None])
     torch.testing.assert_close(storage.observations["a"], number[..., None])
     torch.testing.assert_close(storage.actions_log_prob, number[..., None])
-    torch.testing.assert_close(storage.distribution_params[0], number[..., None].expand(3, 4, 2))
+    torch.testing.assert_close(storage.action_mean, number[..., None].expand(3, 4, 2))
     assert storage.dones.squeeze(-1).int().tolist() == [[0] * 4, [0, 0, 0, 1], [1] * 4]
     assert storage.time_outs.squeeze(-1).int().tolist() == [[0] * 4, [0] * 4, [0, 0, 0, 1]]
 
 
 def test_a_full_rollout_takes_no_more_until_it_is_cleared(storage):
     for t in range(STEPS):
-        storage.add_transition(step(t))
+        write(storage, t)
     with pytest.raises(OverflowError, match="clear"):
-        storage.add_transition(step(3))
+        write(storage, 3)
     storage.clear()
-    storage.add_transition(step(3))
+    write(storage, 3)
     assert storage.task_rewards[0, 0, 0] == 3.0
 
 

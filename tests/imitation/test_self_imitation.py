@@ -49,15 +49,19 @@ def rollout(imitation, shift, valid=True):
         batch_size=[WORLDS],
     )
     storage = GroupRolloutStorage(WORLDS, STEPS, 1, before, 1, "cpu")
-    extras = {
-        names.EXTRA_TIME_OUTS: torch.zeros(WORLDS, dtype=torch.bool),
-        names.EXTRA_IMITATION: features,
-        names.EXTRA_VALID: torch.full((WORLDS,), valid),
-    }
-    for step in range(STEPS):
-        storage.observations[step].copy_(before)
-        zero = torch.zeros(WORLDS)
-        imitation.record(before, zero, zero, extras)
+    zero = torch.zeros(WORLDS)
+    for _ in range(STEPS):
+        storage.write(before)
+        imitation.record(
+            storage,
+            before,
+            after=features,
+            valid=torch.full((WORLDS,), valid),
+            rewards=zero,
+            dones=zero,
+            time_outs=zero.bool(),
+        )
+        storage.next_row()
     return imitation.rewards()[-1], storage
 
 

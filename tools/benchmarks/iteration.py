@@ -27,7 +27,7 @@ PARTS = (
     ("alg", "process_env_step", "record"),
     ("alg.imitation", "rewards", "imitation scoring"),
     ("alg.imitation.selector", "record", "premium windows"),
-    ("alg.reference", "record", "residual reward"),
+    ("alg.reference", "judge", "residual reward"),
     ("alg", "compute_returns", "returns"),
     ("alg", "_update_policy", "policy update"),
     ("alg.estimation", "update", "estimator"),

@@ -1,0 +1,108 @@
+"""What the learner does in a step of the rollout, before and after the environment's."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import torch
+from tensordict import TensorDict
+
+from kiras_rl import interfaces as names
+from kiras_rl.algorithms.parts import Parts
+from kiras_rl.recorded import Recorded, Slot
+
+OUTCOME = (
+    names.NEXT_PROPRIO,
+    names.EXTRA_TIME_OUTS,
+    names.EXTRA_IMITATION,
+    names.EXTRA_VALID,
+    names.EXTRA_FLAT,
+)
+"""What of `extras` is learned from."""
+
+
+class Rollout:
+    """Acts, and stores what was seen, done and what came of it.
+
+    On a GPU either half is one graph instead of fifty small kernels.
+    """
+
+    def __init__(self, parts: Parts, device: str) -> None:
+        """Take the parts, which see every step."""
+        self._parts = parts
+        self._seen, self._outcome = SimpleNamespace(), SimpleNamespace()  # of the current step
+        self._act = Recorded(self._act_and_write, device, carried=lambda: _slots(self._seen))
+        self._store = Recorded(
+            self._write_outcome, device, carried=lambda: _slots(self._seen, self._outcome)
+        )
+
+    @torch.no_grad()
+    def act(self, obs: TensorDict) -> torch.Tensor:
+        """Sample actions, (N, J).
+
+        Raises:
+            OverflowError: The rollout is full.
+        """
+        self._parts.storage.claim_row()
+        vars(self._seen).update(obs)
+        self._outcome.actions = self._act()
+        return self._outcome.actions
+
+    @torch.no_grad()
+    def store(self, rewards: torch.Tensor, dones: torch.Tensor, extras: dict) -> None:
+        """Store what the environment returned for the last actions.
+
+        Args:
+            rewards: Task reward, (N,).
+            dones: Ended episodes, (N,).
+            extras: See kiras_rl.interfaces.
+        """
+        vars(self._outcome).update({name: extras[name] for name in OUTCOME if name in extras})
+        self._outcome.rewards, self._outcome.dones = rewards, dones
+        self._store()
+
+    def forget(self) -> None:
+        """Record anew: a loaded checkpoint replaced what the graphs write to."""
+        self._act.forget()
+        self._store.forget()
+
+    def _act_and_write(self) -> torch.Tensor:
+        """Compute the context once, here: it is an observation of the step as all others are."""
+        parts, seen = self._parts, vars(self._seen)
+        if parts.estimation:
+            seen = seen | {names.CONTEXT: parts.estimation.context(seen)}
+        actions = parts.actor(seen, stochastic_output=True)
+        mean, std = parts.actor.output_distribution_params
+        parts.storage.write(
+            seen,
+            actions=actions,
+            actions_log_prob=parts.actor.get_output_log_prob(actions),
+            action_mean=mean,
+            action_std=std,
+        )
+        return actions
+
+    def _write_outcome(self) -> tuple[()]:
+        parts, seen, outcome = self._parts, vars(self._seen), vars(self._outcome)
+        rewards, dones = outcome["rewards"], outcome["dones"]
+        time_outs = outcome[names.EXTRA_TIME_OUTS]
+        observed, total = {names.NEXT_PROPRIO: outcome[names.NEXT_PROPRIO]}, rewards
+        if parts.reference:
+            flat_action, residual = parts.reference.judge(seen, outcome["actions"])
+            is_flat = outcome[names.EXTRA_FLAT]
+            observed |= {names.FLAT_ACTION: flat_action, names.IS_FLAT: is_flat}
+            total = rewards + residual
+        parts.storage.write(observed, task_rewards=total, dones=dones, time_outs=time_outs)
+        if parts.imitation:
+            after, valid = outcome[names.EXTRA_IMITATION], outcome[names.EXTRA_VALID]
+            storage = parts.storage
+            parts.imitation.record(storage, seen, after, valid, rewards, dones, time_outs)
+        if parts.estimation:
+            parts.estimation.record(rewards, dones)
+        parts.storage.next_row()
+        return ()
+
+
+def _slots(*owners: SimpleNamespace) -> list[Slot]:
+    """Return all attributes of all owners."""
+    return [(owner, name) for owner in owners for name in vars(owner)]
