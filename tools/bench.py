@@ -24,6 +24,7 @@ from kiras_rl.robots.robot import RobotError
 from kiras_rl.schema import Config
 from kiras_rl.tools.benchmarks import (
     bound,
+    contacts,
     inference,
     iteration,
     learning,
@@ -64,6 +65,8 @@ scale      speed and memory of the environment from 256 worlds upwards, doubled 
            short; then of one size on terrain, without height_scan, and with 1, 5 and 10 skills
 options    speed against accuracy of MuJoCo's options, on walks of the policy that comes with the
            robot. Always the native backend on the CPU.
+contacts   speed against accuracy of the search for contacts with height fields, the only ones that
+           search here. C MuJoCo, one thread; the same settings hold on the other backend
 peer       the Go1 of this project beside mjlab's; needs --peer, which also adds this part
 """
 
@@ -88,6 +91,7 @@ PARTS: dict[str, ModuleType] = {
     "inference": inference,
     "scale": scale,
     "options": options,
+    "contacts": contacts,
     "peer": peer,
 }
 USUAL = ("physics", "terrain", "learning", "iteration", "bound", "inference")

@@ -163,6 +163,24 @@ def test_a_finer_time_step_is_nearer_to_the_reference(bench, tmp_path):
     assert "* configuration" in (tmp_path / "tables.txt").read_text()
 
 
+def test_contacts_err_less_the_longer_they_are_searched(bench, monkeypatch, tmp_path):
+    monkeypatch.setattr("kiras_rl.tools.benchmarks.contacts.POSES", 25)
+    contacts = bench("--parts=contacts")[0]["contacts"]
+    errors = contacts["errors"]
+    assert contacts["contacts"] > contacts["poses"]
+    assert errors["reference"]["depth_max"] == 0.0
+    coarse, fine = errors["tolerance 1e-3"], errors["tolerance 1e-5"]
+    assert 0.0 <= fine["depth_mean"] < coarse["depth_mean"] < 1e-3  # the tolerance, m
+    assert "* configuration" in (tmp_path / "tables.txt").read_text()
+
+
+def test_contacts_need_a_height_field(capsys):
+    rough = ("slopes", "bars", "footholds", "stairs")
+    without = [f"finetuning.env.terrain.types.{name}=null" for name in rough]
+    assert main([*SMALL, "--parts=contacts", *without]) == 2
+    assert "height field" in capsys.readouterr().err
+
+
 def test_options_need_a_policy_that_comes_with_the_robot(capsys, monkeypatch, tmp_path):
     bare = SimpleNamespace(folder=tmp_path)
     monkeypatch.setattr("kiras_rl.tools.policy_files.load_robot", lambda name: bare)
