@@ -4,6 +4,10 @@ import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
 
+WAITING = ("_local_scalar_dense", "nonzero", "masked_select", "normal")
+"""Operations that read values of the device on the host: no graph can hold them."""
+
+
 class Tape(TorchDispatchMode):
     """Stands in for torch.cuda.CUDAGraph and torch.cuda.graph: memory stays, operations repeat."""
 
@@ -19,6 +23,8 @@ class Tape(TorchDispatchMode):
     def __torch_dispatch__(self, function, types, args=(), kwargs=None):
         """Run an operation and note it; what it writes to is remembered as it was."""
         kwargs = kwargs or {}
+        if function.overloadpacket.__name__ in WAITING:
+            raise RuntimeError(f"{function} waits for the device")
         for argument, value in zip(function._schema.arguments, [*args, *[None] * 9], strict=False):
             if argument.alias_info is not None and argument.alias_info.is_write:
                 value = kwargs.get(argument.name, value)

@@ -71,12 +71,15 @@ class Rollout:
         parts, seen = self._parts, vars(self._seen)
         if parts.estimation:
             seen = seen | {names.CONTEXT: parts.estimation.context(seen)}
-        actions = parts.actor(seen, stochastic_output=True)
-        mean, std = parts.actor.output_distribution_params
+        distribution = parts.actor.distribution
+        distribution.update(parts.actor.mlp(parts.actor.get_latent(seen)))
+        mean, std = distribution.params
+        # Not its sample(): torch.normal reads the smallest deviation, and so waits for the device
+        actions = mean + std * torch.randn_like(mean)
         parts.storage.write(
             seen,
             actions=actions,
-            actions_log_prob=parts.actor.get_output_log_prob(actions),
+            actions_log_prob=distribution.log_prob(actions),
             action_mean=mean,
             action_std=std,
         )
