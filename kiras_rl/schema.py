@@ -144,6 +144,7 @@ class PremiumConfig:
     capacity: int
     max_age: int
     min_command: float
+    min_progress: float
     max_distance: float
     per_iteration: int
     keyframe_share: float

@@ -3,7 +3,6 @@
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
-
 WAITING = ("_local_scalar_dense", "nonzero", "masked_select", "normal")
 """Operations that read values of the device on the host: no graph can hold them."""
 

@@ -26,6 +26,7 @@ TINY = (
     "learner.estimator.adaboot=both",
     "learner.imitation.premium.window=24",
     "learner.imitation.premium.min_command=0",
+    "learner.imitation.premium.min_progress=0",
     "learner.imitation.premium.max_distance=100",
     "learner.imitation.discriminator.batch_size=128",
 )

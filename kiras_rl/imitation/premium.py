@@ -9,6 +9,8 @@ from kiras_rl.config import ConfigError
 from kiras_rl.schema import PremiumConfig
 
 RULES = ("topk", "record")
+RUNNING = ("_age", "_reward", "_distance", "_speed", "_progress")
+"""What is added up over a window."""
 
 
 def trajectory_scores(
@@ -69,7 +71,8 @@ class PremiumSelector:
             return torch.full((num_envs,), value, dtype=dtype, device=device)
 
         self._age, self._skill = per_world(0, torch.int64), per_world(-1, torch.int64)
-        self._reward, self._distance, self._speed = per_world(0), per_world(0), per_world(0)
+        self._reward, self._distance = per_world(0), per_world(0)
+        self._speed, self._progress = per_world(0), per_world(0)
         self._completed_at = per_world(0, torch.int64)
         self._completed_score = per_world(-torch.inf)
         self._completed_skill = per_world(0, torch.int64)
@@ -84,6 +87,7 @@ class PremiumSelector:
         skill: torch.Tensor,
         reward: torch.Tensor,
         speed: torch.Tensor,
+        progress: torch.Tensor,
         done: torch.Tensor,
         valid: torch.Tensor,
     ) -> None:
@@ -96,6 +100,7 @@ class PremiumSelector:
             skill: Commanded skill, (N,).
             reward: Task reward, unclipped, (N,).
             speed: Commanded speed, (N,), m/s.
+            progress: Speed of the base in the direction of the command, (N,), m/s.
             done: Episodes that ended with this step, (N,) bool.
             valid: Whether the step counts; a failure does not, (N,) bool.
         """
@@ -108,6 +113,7 @@ class PremiumSelector:
         self._reward += reward
         self._distance += torch.linalg.vector_norm(features - self._keyframes[skill], dim=-1)
         self._speed += speed
+        self._progress += progress
         full = (self._age == window) & valid
         self._complete(full)
         self._restart(full | done | ~valid)
@@ -116,6 +122,7 @@ class PremiumSelector:
     def _complete(self, full: torch.Tensor) -> None:
         config = self._config
         moving = self._speed / config.window >= config.min_command
+        moving &= self._progress >= config.min_progress * self._speed
         near = self._distance / config.window <= config.max_distance
         score = trajectory_scores(
             self._reward, self._distance, config.window, config.distance_weight
@@ -129,8 +136,8 @@ class PremiumSelector:
             completed.copy_(torch.where(eligible, value, completed))
 
     def _restart(self, mask: torch.Tensor) -> None:
-        for running in (self._age, self._reward, self._distance, self._speed):
-            running.masked_fill_(mask, 0)
+        for name in RUNNING:
+            getattr(self, name).masked_fill_(mask, 0)
 
     def select(self, iteration: int) -> None:
         """Move the best windows of the last rollout, of all ranks, into the buffer of each."""

@@ -114,11 +114,14 @@ class SelfImitation:
         storage.write_row(self._pairs, torch.cat([before[names.IMITATION], after], dim=-1))
         storage.write_row(self._valid, valid)
         failed = dones.bool() & ~time_outs
+        command, velocity = before[names.COMMAND][:, :2], before[names.VELOCITY][:, :2]
+        speed = torch.linalg.vector_norm(command, dim=-1)
         self.selector.record(
             features=after,
             skill=before[names.SKILL].argmax(dim=-1),
             reward=rewards,
-            speed=torch.linalg.vector_norm(before[names.COMMAND][:, :2], dim=-1),
+            speed=speed,
+            progress=(velocity * command).sum(dim=-1) / speed.clamp(min=1e-6),
             done=dones.bool(),
             valid=valid & ~failed,
         )

@@ -14,8 +14,8 @@ from kiras_rl.schema import PremiumConfig
 WINDOW, STEPS, WORLDS, FEATURES = 5, 4, 3, 2
 KEYFRAMES = torch.tensor([[0.0, 0.0], [10.0, 0.0]])
 CONFIG = PremiumConfig(
-    rule="topk", window=WINDOW, capacity=3, max_age=10, min_command=0.2, max_distance=1e9,
-    per_iteration=2, keyframe_share=0.5, distance_weight=1.0,
+    rule="topk", window=WINDOW, capacity=3, max_age=10, min_command=0.2, min_progress=0.5,
+    max_distance=1e9, per_iteration=2, keyframe_share=0.5, distance_weight=1.0,
 )  # fmt: skip
 
 
@@ -27,7 +27,10 @@ class Recorder:
         self.selector = PremiumSelector(config, KEYFRAMES, num_worlds, STEPS)
         self.num_worlds, self.time = num_worlds, 0
 
-    def steps(self, count, skill=0, reward=0.0, speed=0.5, done=False, valid=True, features=None):
+    def steps(
+        self, count, skill=0, reward=0.0, speed=0.5, progress=1.0, done=False, valid=True,
+        features=None,
+    ):  # fmt: skip
         """Record steps in which every world is alike, or differs by a list of values."""
 
         def each(value, dtype):
@@ -41,6 +44,7 @@ class Recorder:
                 skill=each(skill, torch.int64),
                 reward=each(reward, torch.float32),
                 speed=each(speed, torch.float32),
+                progress=each(progress, torch.float32),
                 done=each(done, torch.bool),
                 valid=each(valid, torch.bool),
             )
@@ -143,11 +147,20 @@ def test_a_change_of_skill_begins_a_new_window():
     assert recorder.selector.trajectories[1, 0, :, 0].tolist() == [3, 4, 5, 6, 7]
 
 
-def test_standing_is_no_premium_motion():
+def test_a_window_that_is_hardly_asked_to_move_is_no_premium_motion():
     recorder = Recorder()
     for speed in (0.5, 0.4, 0.0, 0.0, 0.0):  # mean 0.18 where the command ends, 0.2 elsewhere
         recorder.steps(1, speed=[speed, 0.2, 0.0])
     assert recorder.select() == [1, 0]
+    assert recorder.selector.trajectories[0, 0, 0, 1] == 1
+
+
+def test_standing_is_no_premium_motion():
+    recorder = Recorder()
+    for progress in ([0.0, 1.0, 0.2], [0.0, 0.25, 0.2], [0.0, 0.0, 0.2]):
+        recorder.steps(1, speed=0.5, progress=progress)
+    recorder.steps(WINDOW - 3, speed=0.5, progress=[0.0, 0.0, 0.2])
+    assert recorder.select() == [1, 0]  # 1.25 of 2.5 m/s is half of the way, 1.0 is less
     assert recorder.selector.trajectories[0, 0, 0, 1] == 1
 
 

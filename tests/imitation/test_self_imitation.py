@@ -45,6 +45,7 @@ def rollout(imitation, shift, valid=True):
             names.IMITATION: features,
             names.SKILL: KEYFRAMES[skill][:, 2:],
             names.COMMAND: torch.full((WORLDS, 3), 0.3),
+            names.VELOCITY: torch.full((WORLDS, 3), 0.3),
         },
         batch_size=[WORLDS],
     )
