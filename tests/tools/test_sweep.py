@@ -222,7 +222,7 @@ def test_an_unknown_sweep_is_refused(capsys):
 
 
 def test_the_shipped_sweep_compares_the_ablations_at_one_budget(tmp_path):
-    assert list_sweeps() == ["ablations", "efficiency"]
+    assert list_sweeps() == ["ablations", "both_phases", "efficiency"]
     runs = load_sweep("ablations", [], tmp_path)
     ablations = [name for name in list_configs() if name.startswith("ablations/")]
     labels = {"kiras", *(name.removeprefix("ablations/") for name in ablations)}
@@ -238,6 +238,15 @@ def test_the_shipped_sweep_compares_the_ablations_at_one_budget(tmp_path):
         assert (config.learner.multi_critic is None) == (run.label == "no_muc")
         assert (config.learner.estimator is None) == (run.label == "no_ece")
         assert (config.learner.skill_init is None) == (run.label == "no_skill_init")
+
+
+def test_both_phases_of_the_ablations_have_one_budget(tmp_path):
+    runs = load_sweep("both_phases", [], tmp_path)
+    assert [r.label for r in runs] == [r.label for r in load_sweep("ablations", [], tmp_path)[:5]]
+    for config in (run.config for run in runs):
+        steps = config.num_envs * config.learner.ppo.num_steps
+        assert steps * config.iterations == 12_288_000
+        assert steps * config.finetuning.iterations == 9_830_400
 
 
 def test_the_sweep_of_efficiency_uses_the_same_steps_in_other_ways(tmp_path):
