@@ -133,6 +133,7 @@ class DiscriminatorConfig:
     batch_size: int
     gradient_penalty: float
     noise: list[list[float]]
+    precision: str
 
 
 @dataclass

@@ -42,6 +42,7 @@ EVENTFUL = (
     "learner.imitation.premium.window=24",
     "learner.imitation.premium.capacity=6",
     "learner.imitation.premium.min_command=0",
+    "learner.imitation.discriminator.precision=float32",  # gradients are compared to 1e-5
     "learner.imitation.premium.min_progress=0",
     "learner.imitation.premium.max_distance=100",
 )

@@ -14,7 +14,7 @@ from kiras_rl.algorithms.losses import discriminator_loss, gradient_penalty
 from kiras_rl.algorithms.storage import GroupRolloutStorage
 from kiras_rl.imitation.premium import PremiumSelector
 from kiras_rl.interfaces import SkillEnv
-from kiras_rl.models.discriminator import Discriminator, imitation_reward
+from kiras_rl.models.discriminator import Discriminator, imitation_reward, uses_bfloat16
 from kiras_rl.recorded import Recorded
 from kiras_rl.schedules import piecewise_linear
 from kiras_rl.schema import ImitationConfig
@@ -52,7 +52,9 @@ class SelfImitation:
         self._device = device
         self._noise = feature_noise.repeat(2)
         self._noise_factor = torch.ones((), device=device)
-        self.discriminator = Discriminator(features, config.discriminator.hidden_dims).to(device)
+        half = uses_bfloat16(config.discriminator.precision, device)
+        dims = config.discriminator.hidden_dims
+        self.discriminator = Discriminator(features, dims, bfloat16=half).to(device)
         rate = config.discriminator.learning_rate
         self.optimizer = make_adam(self.discriminator.parameters(), rate, device)
         self.selector = PremiumSelector(config.premium, keyframe_features, num_envs, num_steps)

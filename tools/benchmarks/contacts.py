@@ -16,7 +16,7 @@ import numpy as np
 from rich.table import Table
 
 from kiras_rl.config import ConfigError
-from kiras_rl.envs.model import CCD_ITERATIONS, CCD_TOLERANCE, Scene, build_scene
+from kiras_rl.envs.model import Scene, build_scene
 from kiras_rl.envs.terrain_library import TerrainLibrary, build_library
 from kiras_rl.envs.terrains import HALF
 from kiras_rl.phases import FINETUNING, phase_config
@@ -29,9 +29,7 @@ POSES = 400
 JOINT_NOISE = 0.3  # rad, 1 sigma
 SEED = 1
 CHOICE, REFERENCE = "configuration", "reference"
-SETTINGS = {
-    CHOICE: (CCD_ITERATIONS, CCD_TOLERANCE),
-    "MuJoCo's own": (35, 1e-6),
+VARIANTS = {
     "tolerance 1e-5": (35, 1e-5),
     "tolerance 1e-4": (35, 1e-4),
     "tolerance 1e-3": (35, 1e-3),
@@ -39,6 +37,7 @@ SETTINGS = {
     "12 iterations": (12, 1e-6),
     "8 iterations": (8, 1e-6),
     "6 iterations": (6, 1e-6),
+    "12 iterations, tolerance 1e-4": (12, 1e-4),
     REFERENCE: (200, 1e-12),
 }
 """Name -> (iterations, tolerance in m)."""
@@ -67,16 +66,17 @@ def measure(request: Request) -> Figures:
             "all but flat have one"
         )
     scene = build_scene(robot, config.sim.timestep, config.sim.solver_iterations, library=library)
-    poses = _draw(robot, library)
-    contacts = {name: _collide(scene, poses, *setting)[0] for name, setting in SETTINGS.items()}
+    option, poses = scene.model.opt, _draw(robot, library)
+    settings = {CHOICE: (int(option.ccd_iterations), float(option.ccd_tolerance)), **VARIANTS}
+    contacts = {name: _collide(scene, poses, *setting)[0] for name, setting in settings.items()}
     times = interleave(
-        {name: _timed(scene, poses, setting) for name, setting in SETTINGS.items()}, request.rounds
+        {name: _timed(scene, poses, setting) for name, setting in settings.items()}, request.rounds
     )
     return {
         "robot": robot.name,
         "poses": len(poses),
         "contacts": sum(map(len, contacts[REFERENCE])),
-        "settings": SETTINGS,
+        "settings": settings,
         "errors": {n: _differences(found, contacts[REFERENCE]) for n, found in contacts.items()},
         "seconds_per_pose": {name: median(seconds) for name, seconds in times.items()},
         "speed": {name: summarise(ratios(times, CHOICE, name)) for name in times},
