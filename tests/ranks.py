@@ -27,6 +27,7 @@ ONE_STEP = (
     "learner.ppo.num_mini_batches=1",
     "learner.estimator.adaboot=off",
     "learner.imitation.discriminator.updates=1",
+    "learner.imitation.discriminator.precision=float32",  # gradients are compared to 1e-5
     "learner.imitation.premium.keyframe_share=1",
 )
 
@@ -42,7 +43,6 @@ EVENTFUL = (
     "learner.imitation.premium.window=24",
     "learner.imitation.premium.capacity=6",
     "learner.imitation.premium.min_command=0",
-    "learner.imitation.discriminator.precision=float32",  # gradients are compared to 1e-5
     "learner.imitation.premium.min_progress=0",
     "learner.imitation.premium.max_distance=100",
 )
