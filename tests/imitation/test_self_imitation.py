@@ -36,7 +36,7 @@ def make_imitation():
     return make
 
 
-def rollout(imitation, shift, valid=True):
+def rollout(imitation, shift, valid=True, velocity=0.3):
     """Hold every world in its keyframe plus `shift`; return the last rewards and the storage."""
     skill = torch.arange(WORLDS) % 2
     features = KEYFRAMES[skill] + torch.tensor([*shift, 0.0, 0.0])
@@ -45,7 +45,7 @@ def rollout(imitation, shift, valid=True):
             names.IMITATION: features,
             names.SKILL: KEYFRAMES[skill][:, 2:],
             names.COMMAND: torch.full((WORLDS, 3), 0.3),
-            names.VELOCITY: torch.full((WORLDS, 3), 0.3),
+            names.VELOCITY: torch.full((WORLDS, 3), velocity),
         },
         batch_size=[WORLDS],
     )
@@ -110,6 +110,14 @@ def test_the_gradient_penalty_keeps_the_slope_low(make_imitation):
     # 2 s^2: 2 (1 - s/2)^2 + 2 s^2 is least at s = 2/5.
     assert scalars["Discriminator/expert"] == pytest.approx(0.2, abs=0.02)
     assert scalars["Discriminator/policy"] == pytest.approx(-0.2, abs=0.02)
+
+
+@pytest.mark.parametrize(("velocity", "is_gait"), [(0.3, True), (0.0, False), (-0.3, False)])
+def test_premium_motions_go_where_they_are_told(make_imitation, velocity, is_gait):
+    imitation = make_imitation(f"learner.imitation.premium.window={STEPS}")
+    _, storage = rollout(imitation, [0.0, 0.0], velocity=velocity)
+    scalars = imitation.update(storage, 0, progress=0.0)
+    assert (scalars["Premium/count_a"] > 0) is is_gait
 
 
 def test_the_reward_is_logged_by_skill(make_imitation):
