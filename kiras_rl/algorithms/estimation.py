@@ -44,7 +44,8 @@ class Estimation:
         self.config = config
         self.estimator = estimator.to(device)
         self._device = device
-        self.optimizer = make_adam(self.estimator.parameters(), config.learning_rate, device)
+        self._learning_rate = torch.tensor(config.learning_rate, device=device)
+        self.optimizer = make_adam(self.estimator.parameters(), self._learning_rate, device)
         self._data: dict[str, torch.Tensor] = {}
         self._num_mini_batches = 1
         self._epoch = Recorded(
@@ -85,6 +86,10 @@ class Estimation:
             velocity = torch.where(told, context[:, :VELOCITY_DIM], obs[names.VELOCITY])
             context = torch.cat([velocity, context[:, VELOCITY_DIM:]], dim=-1)
         return context
+
+    def scale_steps(self, factor: float) -> None:
+        """Take steps of this share of the configured size from now on."""
+        self._learning_rate.fill_(factor * self.config.learning_rate)
 
     def record(self, rewards: torch.Tensor, dones: torch.Tensor) -> None:
         """Let AdaBoot see a step's rewards and dones, (N,)."""

@@ -236,10 +236,17 @@ class KirasPPO(PPO):
         return kl
 
     def _apply_schedules(self) -> None:
-        """Set action noise and step size of the next iteration."""
-        std = piecewise_linear(self.config.ppo.action_std, self.progress)
+        """Set action noise and step sizes of the next iteration.
+
+        A step of the estimator changes what the actor is told, and so its actions, past PPO's trust
+        region: by a KL divergence that grows as the noise falls. So its step size falls with it.
+        """
+        schedule = self.config.ppo.action_std
+        std = piecewise_linear(schedule, self.progress)
         self.actor.distribution.std_param.fill_(std)
         self.desired_kl.fill_(piecewise_linear(self.config.ppo.desired_kl, self.progress))
+        if self.estimation:
+            self.estimation.scale_steps(std / max(value for _, value in schedule))
 
     # --- skills ---------------------------------------------------------------------------------
 

@@ -48,6 +48,16 @@ def test_the_step_size_that_is_logged_is_the_optimizer_s(make_runner):
         alg.load(copy.deepcopy(alg.save()))
 
 
+def test_the_estimator_takes_smaller_steps_as_the_action_noise_falls(make_runner):
+    changes = ["learner.ppo.action_std=[[0,0.5],[0.5,0.1]]", "learner.estimator.learning_rate=0.01"]
+    alg = make_runner("iterations=8", *changes).alg
+    rates = []
+    for iteration in (0, 2, 8):
+        alg.load(copy.deepcopy(alg.save()) | {"iteration": iteration})
+        rates += [group["lr"].item() for group in alg.estimation.optimizer.param_groups]
+    assert rates == pytest.approx([0.01, 0.006, 0.002])  # noise: 0.5, 0.3, 0.1
+
+
 @pytest.mark.parametrize("without", [(), *[(part,) for part in PARTS], PARTS], ids="-".join)
 def test_it_trains_whatever_is_left_out(make_runner, without):
     runner, seen = make_runner(*null(*without)), []
