@@ -19,8 +19,8 @@ help:  ## show these lines
 train: .venv/.installed  ## train the five skills of Solo-8 (or CFG=<another configuration>)
 	.venv/bin/kiras-train --cfg $(CFG)
 
-test: .venv/.installed-dev  ## run the fast tests
-	.venv/bin/pytest
+test: .venv/.installed-dev  ## run the fast tests, a process a core
+	.venv/bin/pytest -n auto --dist loadfile
 
 lint: .venv/.installed-dev  ## check style and format
 	.venv/bin/ruff check
