@@ -19,8 +19,9 @@ help:  ## show these lines
 train: .venv/.installed  ## train the five skills of Solo-8 (or CFG=<another configuration>)
 	.venv/bin/kiras-train --cfg $(CFG)
 
+# Threads of torch that wait take no core from the process beside them.
 test: .venv/.installed-dev  ## run the fast tests, a process a core
-	.venv/bin/pytest -n auto --dist loadfile
+	OMP_WAIT_POLICY=passive .venv/bin/pytest -n auto --dist loadfile
 
 lint: .venv/.installed-dev  ## check style and format
 	.venv/bin/ruff check

@@ -231,7 +231,7 @@ def test_the_shipped_sweep_compares_the_ablations_at_one_budget(tmp_path):
     assert [run.config.seed for run in runs] == 5 * [1] + 5 * [2]
     for run in runs:
         config = run.config
-        assert config.num_envs * config.learner.ppo.num_steps * config.iterations == 6_389_760
+        assert config.num_envs * config.learner.ppo.num_steps * config.iterations == 9_830_400
         assert config.finetuning is None
         assert run.folder == tmp_path / "sweeps" / "ablations" / run.label / f"seed_{config.seed}"
         assert (config.learner.imitation is None) == (run.label == "no_sil")
