@@ -51,6 +51,9 @@ def find_mistake(values: dict) -> str | None:
         value = _select(values, key)
         if value is not None and not _is_schedule(value):
             return f"{key}={value}: give [fraction of T1, value] points in ascending order"
+    noise = values["learner"]["ppo"]["action_std"]
+    if not all(std > 0 for _, std in noise):
+        return f"learner.ppo.action_std={noise}: every value must be positive"
     batches, steps = values["learner"]["ppo"]["num_mini_batches"], _rollout(values)
     if batches > steps:
         return (

@@ -132,6 +132,12 @@ def test_a_schedule_is_a_list_of_points_in_order(key, points):
     assert "give [fraction of T1, value] points" in refusal("solo8", [f"{key}={points}"])
 
 
+@pytest.mark.parametrize("last", [0, -0.1])
+def test_action_noise_never_ends(last):
+    message = refusal("solo8", [f"learner.ppo.action_std=[[0,0.5],[1,{last}]]"])
+    assert message.endswith(": every value must be positive")
+
+
 def test_a_rollout_must_fill_its_batches():
     message = refusal("solo8", ["num_envs=2", "learner.ppo.num_mini_batches=49"])
     assert message.startswith("learner.ppo.num_mini_batches=49: at most the 48 steps of a rollout")
