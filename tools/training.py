@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
 from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
@@ -32,6 +31,7 @@ from kiras_rl.tools.flat_policy import check_fit, read_flat
 from kiras_rl.tools.progress import Progress
 from kiras_rl.tools.protocols import flat, terrain
 from kiras_rl.tools.report.terminal import as_rich
+from kiras_rl.tools.source import source_commit
 
 MISTAKES = (CheckpointError, ConfigError, ExportError, PolicyError, RobotError, TrainingError)
 """Errors whose message is all that a user needs."""
@@ -131,7 +131,7 @@ def build(
     alone.sim.threads = alone.sim.threads or distributed.core_share()
     env = make_env(alone, device, num_envs)
     evaluators = make_evaluators(config, phase, device)
-    runner = KirasRunner(env, config, run_dir, device, evaluators, _source_commit(), phase)
+    runner = KirasRunner(env, config, run_dir, device, evaluators, source_commit(), phase)
     # What could not be exported is refused now, not after hours of training.
     PolicyMetadata.from_dict(runner.describe_policy())
     return runner
@@ -163,16 +163,6 @@ def _device_of_rank(name: str) -> str:
             "torchrun --nproc-per-node, or set device=cpu"
         )
     return f"cuda:{distributed.local_rank()}"
-
-
-def _source_commit() -> str:
-    """Return the commit of the checkout that runs, or "unknown" for an installed package."""
-    folder = Path(__file__).resolve().parents[1]
-    command = ["git", "-C", str(folder), "describe", "--always", "--dirty", "--abbrev=12"]
-    try:
-        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
-    except (OSError, subprocess.CalledProcessError):
-        return "unknown"
 
 
 # --- its training --------------------------------------------------------------------------------
