@@ -162,7 +162,7 @@ class RewardSum:
         """Look the terms up.
 
         Raises:
-            ConfigError: Unknown term or parameter.
+            ConfigError: Unknown term or parameter, or a parameter that is no number.
         """
         terms = {name: values for name, values in config.terms.items() if values is not None}
         for name, values in terms.items():
@@ -185,7 +185,8 @@ class RewardSum:
 def _bind(name: str, values: dict) -> Callable[[Step], torch.Tensor]:
     function = find_function(globals(), name, Step, where="env.rewards.terms")
     parameters = {key: value for key, value in values.items() if key != "weight"}
-    allowed = list(inspect.signature(function).parameters)[1:]
+    signature = inspect.signature(function)
+    allowed = list(signature.parameters)[1:]
     unknown = [key for key in parameters if key not in allowed]
     if unknown or "weight" not in values:
         problem = f"unknown parameter '{unknown[0]}'" if unknown else "no weight"
@@ -193,7 +194,16 @@ def _bind(name: str, values: dict) -> Callable[[Step], torch.Tensor]:
             f"env.rewards.terms.{name}: {problem}; it takes {', '.join(['weight', *allowed])}"
         )
     try:
-        inspect.signature(function).bind(None, **parameters)
+        signature.bind(None, **parameters)
     except TypeError as error:
         raise ConfigError(f"env.rewards.terms.{name}: {error}") from None
+    for key, value in parameters.items():
+        if signature.parameters[key].annotation in ("int", "float"):
+            _check_number(f"env.rewards.terms.{name}.{key}", value)
     return partial(function, **parameters)
+
+
+def _check_number(where: str, value: object) -> None:
+    if not isinstance(value, int | float) or isinstance(value, bool):
+        shown = "null" if value is None else repr(value)
+        raise ConfigError(f"{where}={shown}: must be a number")

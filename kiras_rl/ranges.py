@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterable, Iterator
 from typing import Any
 
 from kiras_rl.schedules import piecewise_linear
@@ -27,8 +29,66 @@ POSITIVE = (
     "learner.imitation.premium.per_iteration",
     "learner.estimator.epochs",
     "evaluation.worlds_per_skill",
+    "evaluation.terrain.robots",
     "finetuning.iterations",
+    "learner.ppo.actor_dims",
+    "learner.ppo.critic_dims",
+    "learner.imitation.discriminator.hidden_dims",
+    "learner.estimator.encoder_dims",
+    "learner.estimator.decoder_dims",
 )
+"""Of a list every number."""
+
+NOT_NEGATIVE = (
+    "env.randomization.friction",
+    "env.randomization.kp_factor",
+    "env.randomization.kd_factor",
+    "env.randomization.torque_factor",
+    "env.randomization.action_delay",
+    "learner.ppo.learning_rate",  # at 0 a part does not learn
+    "learner.ppo.learning_rate_range",
+    "learner.imitation.discriminator.learning_rate",
+    "learner.estimator.learning_rate",
+    "learner.estimator.latent_dim",  # at 0 the context is the velocity alone
+)
+"""Of a list every number."""
+
+_LARGEST_SEED = 2**63 - 1  # torch takes one bit more, which leaves room for the number of a rank
+
+LIMITS = {
+    "seed": (0, _LARGEST_SEED),
+    "env.terrain.seed": (0, _LARGEST_SEED),
+    "learner.skill_init.floor": (0, 0.5),  # 1 / S of S skills; one skill has no use for it
+}
+"""The least and the largest value."""
+
+RANGES = (
+    "env.commands.lin_vel_x",
+    "env.commands.lin_vel_y",
+    "env.commands.ang_vel_z",
+    "env.randomization.friction",
+    "env.randomization.payload",
+    "env.randomization.com_shift",
+    "env.randomization.kp_factor",
+    "env.randomization.kd_factor",
+    "env.randomization.torque_factor",
+    "env.randomization.action_delay",
+    "env.randomization.push_velocity",
+    "learner.ppo.learning_rate_range",
+    "evaluation.terrain.command",
+)
+"""[low, high]. Pairs of terrain are no ranges: from the lowest to the top level they may fall."""
+
+NOT_EMPTY = ("learner.ppo.actor_dims", "learner.ppo.critic_dims")
+
+TERMS = {
+    "env.observations.proprio": ("scale", "noise"),
+    "env.observations.critic": ("scale", "noise"),
+    "env.observations.imitation": ("scale", "noise"),
+    "env.rewards.terms": ("weight",),
+    "env.terrain.types": ("proportion",),
+}
+"""Lists of terms, and the keys that hold a number in each of their entries."""
 
 SCHEDULES = (
     "learner.ppo.action_std",
@@ -40,20 +100,85 @@ SCHEDULES = (
 def find_mistake(values: dict) -> str | None:
     """Return what is wrong with the values of a whole configuration, or None.
 
+    Of the changes that finetuning makes only the numbers are looked at: kiras_rl.phases merges them
+    into a whole configuration, which is looked at in full.
+
     Args:
         values: Nested plain values; a part that is null is not looked at.
     """
-    for key in POSITIVE:
-        value = _select(values, key)
-        if value is not None and not value > 0:
+    checks = (
+        _find_infinite,  # what the others compare is finite
+        _find_outside,
+        _find_disorder,
+        _find_silence,
+        _find_empty,
+        _find_no_number,
+        _find_large_batches,
+    )
+    return next((mistake for check in checks if (mistake := check(values))), None)
+
+
+def _find_infinite(values: dict) -> str | None:
+    for key, value in _leaves(values):
+        if not all(math.isfinite(x) for x in _scalars(value) if isinstance(x, float)):
+            return f"{key}={value}: must be finite"
+    return None
+
+
+def _find_outside(values: dict) -> str | None:
+    for key, value in _given(values, POSITIVE):
+        if not all(x > 0 for x in _scalars(value)):
             return f"{key}={value}: must be positive"
-    for key in SCHEDULES:
-        value = _select(values, key)
-        if value is not None and not _is_schedule(value):
+    for key, value in _given(values, NOT_NEGATIVE):
+        if not all(x >= 0 for x in _scalars(value)):
+            return f"{key}={value}: must not be negative"
+    for key, value in _given(values, LIMITS):
+        low, high = LIMITS[key]
+        if not low <= value <= high:
+            return f"{key}={value}: allowed are {low} to {high}"
+    return None
+
+
+def _find_disorder(values: dict) -> str | None:
+    for key, (low, high) in _given(values, RANGES):
+        if low > high:
+            return f"{key}={[low, high]}: give [low, high], the lower number first"
+    for key, value in _given(values, SCHEDULES):
+        if not _is_schedule(value):
             return f"{key}={value}: give [fraction of T1, value] points in ascending order"
+    return None
+
+
+def _find_silence(values: dict) -> str | None:
     noise = values["learner"]["ppo"]["action_std"]
     if not all(std > 0 for _, std in noise):
         return f"learner.ppo.action_std={noise}: every value must be positive"
+    return None
+
+
+def _find_empty(values: dict) -> str | None:
+    for key, value in _given(values, NOT_EMPTY):
+        if not value:
+            return f"{key}={value}: give one number at least"
+    for key, terms in _given(values, TERMS):
+        if all(entry is None for entry in terms.values()):
+            return f"{key}: nothing is left of it; keep one entry at least"
+    return None
+
+
+def _find_no_number(values: dict) -> str | None:
+    for where, terms in _given(values, TERMS):
+        for name, entry in terms.items():
+            if not isinstance(entry, dict):
+                continue  # null, or refused where the term is looked up
+            for key in TERMS[where]:
+                if key in entry and not _is_number(entry[key]):
+                    shown = "null" if entry[key] is None else repr(entry[key])
+                    return f"{where}.{name}.{key}={shown}: must be a number"
+    return None
+
+
+def _find_large_batches(values: dict) -> str | None:
     batches, steps = values["learner"]["ppo"]["num_mini_batches"], _rollout(values)
     if batches > steps:
         return (
@@ -73,6 +198,36 @@ def _is_schedule(points: list) -> bool:
     except ValueError:
         return False
     return all(len(point) == 2 for point in points)
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def _leaves(values: dict, prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield what is no mapping, with its dotted key."""
+    for name, value in values.items():
+        if isinstance(value, dict):
+            yield from _leaves(value, f"{prefix}{name}.")
+        else:
+            yield f"{prefix}{name}", value
+
+
+def _scalars(value: Any) -> Iterator[Any]:
+    """Yield what nested lists hold, or a value that is no list."""
+    if isinstance(value, list):
+        for item in value:
+            yield from _scalars(item)
+    else:
+        yield value
+
+
+def _given(values: dict, keys: Iterable[str]) -> Iterator[tuple[str, Any]]:
+    """Yield the keys that are not null, with their values."""
+    for key in keys:
+        value = _select(values, key)
+        if value is not None:
+            yield key, value
 
 
 def _select(values: dict, key: str) -> Any:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import fields, is_dataclass
+from typing import get_args, get_origin, get_type_hints
+
 import pytest
 
 from kiras_rl.config import (
@@ -14,8 +17,10 @@ from kiras_rl.config import (
     save_config,
 )
 from kiras_rl.envs import make_env
-from kiras_rl.ranges import POSITIVE, SCHEDULES
+from kiras_rl.phases import FINETUNING, phase_config
+from kiras_rl.ranges import NOT_NEGATIVE, POSITIVE, RANGES, SCHEDULES, TERMS
 from kiras_rl.runner import KirasRunner
+from kiras_rl.schema import Config
 
 
 @pytest.fixture
@@ -37,6 +42,18 @@ def refusal(*args):
     message = str(caught.value)
     assert "\n" not in message
     return message
+
+
+def pairs(kind, prefix=""):
+    """List the dotted keys of a configuration that hold two numbers."""
+    hints, keys = get_type_hints(kind), []
+    for name in (field.name for field in fields(kind)):
+        for option in (hints[name], *get_args(hints[name])):
+            if is_dataclass(option):
+                keys += pairs(option, f"{prefix}{name}.")
+            elif get_origin(option) is tuple:
+                keys.append(prefix + name)
+    return keys
 
 
 # --- layers and overrides ------------------------------------------------------------------------
@@ -82,6 +99,11 @@ def test_every_shipped_configuration_builds_a_learner(name):
     assert runner.env.num_envs == 2
 
 
+@pytest.mark.parametrize("name", [name for name in list_configs() if name != "solo8_quick"])
+def test_every_shipped_configuration_has_terrain_to_finetune_on(name):
+    assert phase_config(load_config(name), FINETUNING).env.terrain
+
+
 # --- refusals ------------------------------------------------------------------------------------
 
 
@@ -118,9 +140,122 @@ def test_a_wrong_override_is_refused_and_named(override, part):
     assert part in message
 
 
-@pytest.mark.parametrize("key", [key for key in POSITIVE if "terrain" not in key])
+@pytest.mark.parametrize("key", [key for key in POSITIVE if "env.terrain" not in key])
 def test_what_must_be_positive_is_refused_at_zero(key):
-    assert refusal("solo8", [f"{key}=0"]).endswith(": must be positive")
+    value = "[64, 0]" if key.endswith("_dims") else 0
+    message = refusal("solo8", [f"{key}={value}"])
+    assert message.startswith(f"{key}={value}") and message.endswith(": must be positive")
+
+
+@pytest.mark.parametrize("key", NOT_NEGATIVE)
+def test_what_must_not_be_negative_is_refused_below_zero(key):
+    message = refusal("solo8", [f"{key}={'[-1,0]' if key in RANGES else -1}"])
+    assert message.startswith(f"{key}=") and message.endswith(": must not be negative")
+
+
+@pytest.mark.parametrize("key", ["learner.ppo.actor_dims", "learner.ppo.critic_dims"])
+def test_policy_and_critic_have_a_hidden_layer(key):
+    assert refusal("solo8", [f"{key}=[]"]) == f"{key}=[]: give one number at least"
+
+
+@pytest.mark.parametrize(
+    ("override", "allowed"),
+    [
+        ("seed=-1", f"0 to {2**63 - 1}"),
+        (f"seed={2**63}", f"0 to {2**63 - 1}"),
+        ("learner.skill_init.floor=-0.1", "0 to 0.5"),
+        ("learner.skill_init.floor=0.9", "0 to 0.5"),
+    ],
+)
+def test_what_has_limits_is_refused_outside_of_them(override, allowed):
+    assert refusal("solo8", [override]) == f"{override}: allowed are {allowed}"
+
+
+def test_the_largest_seed_is_one_of_torch():
+    env = make_env(load_config("solo8", ["num_envs=1", f"seed={2**63 - 1}"]))
+    assert env.num_envs == 1
+
+
+@pytest.mark.parametrize("key", RANGES)
+def test_a_range_begins_with_its_lower_end(key):
+    message = refusal("solo8", [f"{key}=[4,3]"])
+    assert message.startswith(f"{key}=[4")
+    assert message.endswith(": give [low, high], the lower number first")
+    assert load_config("solo8", [f"{key}=[3,3]"])
+
+
+def test_every_pair_is_a_range_but_that_of_the_levels_of_terrain():
+    assert set(pairs(Config)) == {*RANGES, "env.terrain.noise"}
+
+
+@pytest.mark.parametrize(
+    ("override", "shown"),
+    [
+        ("checkpoint_minutes=.nan", "nan"),
+        ("evaluation.duration=.inf", "inf"),
+        ("env.commands.lin_vel_x=[-.inf,1]", "[-inf, 1.0]"),
+        ("learner.ppo.action_std=[[0,.inf]]", "[[0.0, inf]]"),
+        ("env.rewards.terms.torques.weight=.nan", "nan"),
+        ("env.observations.critic.base_lin_vel.scale=.inf", "inf"),
+        ("finetuning.retention.residual_weight=.nan", "nan"),
+        ("finetuning.env.terrain.types.stairs.riser=[0.1,.nan]", "[0.1, nan]"),
+        ("finetuning.env.terrain.types.stairs.proportion=.nan", "nan"),
+    ],
+)
+def test_what_is_not_finite_is_refused_wherever_it_stands(override, shown):
+    key = override.partition("=")[0]
+    assert refusal("solo8", [override]) == f"{key}={shown}: must be finite"
+
+
+@pytest.mark.parametrize(
+    ("override", "shown"),
+    [
+        ("env.rewards.terms.torques.weight=null", "null"),
+        ("env.rewards.terms.torques.weight=true", "True"),
+        ("env.observations.proprio.joint_pos.noise=abc", "'abc'"),
+        ("env.observations.proprio.joint_pos.scale=null", "null"),
+        ("env.observations.critic.base_lin_vel.scale=[1]", "[1]"),
+        ("env.observations.imitation.joint_pos.noise='0.1'", "'0.1'"),
+    ],
+)
+def test_what_scales_a_term_is_a_number(override, shown):
+    key = override.partition("=")[0]
+    assert refusal("solo8", [override]) == f"{key}={shown}: must be a number"
+
+
+@pytest.mark.parametrize(("value", "shown"), [("abc", "'abc'"), ("null", "null"), ("[1]", "[1]")])
+def test_a_parameter_of_a_reward_is_a_number(value, shown):
+    key = "env.rewards.terms.foot_clearance.height"
+    config = load_config("solo8", ["num_envs=1", f"{key}={value}"])
+    with pytest.raises(ConfigError) as caught:
+        make_env(config)
+    assert str(caught.value) == f"{key}={shown}: must be a number"
+
+
+@pytest.mark.parametrize("key", [key for key in TERMS if "terrain" not in key])
+def test_of_every_group_of_terms_one_is_left(key):
+    group = config_to_dict(load_config("solo8"))
+    for part in key.split("."):
+        group = group[part]
+    message = refusal("solo8", [f"{key}.{name}=null" for name in group])
+    assert message == f"{key}: nothing is left of it; keep one entry at least"
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("env.terrain.seed=-1", f"allowed are 0 to {2**63 - 1}"),
+        ("env.terrain.types.stairs.proportion='abc'", "must be a number"),
+        ("env.rewards.terms.torques.weight='abc'", "must be a number"),
+        ("env.commands.lin_vel_x=[0.6, 0.3]", "give [low, high], the lower number first"),
+        ("learner.ppo.learning_rate=-1.0", "must not be negative"),
+    ],
+)
+def test_the_changes_of_finetuning_are_looked_at_with_what_they_change(override, message):
+    config = load_config("solo8", [f"finetuning.{override}"])
+    with pytest.raises(ConfigError) as caught:
+        phase_config(config, FINETUNING)
+    assert str(caught.value) == f"finetuning: {override}: {message}"
 
 
 @pytest.mark.parametrize(
