@@ -45,7 +45,7 @@ def make_env(
         config.env,
         config.sim,
         robot or load_robot(config.robot),
-        num_envs or config.num_envs,
+        config.num_envs if num_envs is None else num_envs,
         resolve_backend(config.sim.backend, device),
         device,
         config.seed,

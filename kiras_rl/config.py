@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import difflib
+import os
 from dataclasses import asdict
 from functools import cache
 from pathlib import Path
@@ -77,8 +78,10 @@ def config_to_dict(config: Config) -> dict:
 
 
 def save_config(config: Config, path: Path) -> None:
-    """Write a configuration as YAML."""
-    path.write_text(OmegaConf.to_yaml(config_to_dict(config)), encoding="utf-8")
+    """Write a configuration as YAML, whole or not at all."""
+    temporary = path.with_name(f".{path.name}.{os.getpid()}")
+    temporary.write_text(OmegaConf.to_yaml(config_to_dict(config)), encoding="utf-8")
+    temporary.replace(path)
 
 
 def check_resume_overrides(overrides: list[str]) -> None:

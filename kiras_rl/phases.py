@@ -63,7 +63,7 @@ def rsl_rl_config(config: Config, phase: str, step_dt: float) -> dict:
         "learner": alone.learner,
         "iterations": alone.iterations,
         "retention": finetuning.retention if finetuning else None,
-        "reward_scale": step_dt if config.env.rewards.scale_by_dt else 1.0,
+        "reward_scale": step_dt if alone.env.rewards.scale_by_dt else 1.0,
         "num_steps_per_env": alone.learner.ppo.num_steps,
         "save_interval": 0,
     }

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import time
 from collections.abc import Callable
 from contextlib import nullcontext
@@ -30,6 +31,9 @@ from kiras_rl.status import Status
 
 COUNTS = ("Episode/", "Sim/")
 """Tags of numbers that are added up, over the steps of a rollout and over the ranks."""
+
+LOSSES = ("Loss/", "Policy/", "Estimator/", "Discriminator/")
+"""Tags of an update that are numbers as long as its weights are."""
 
 ANEW = (
     "%s is of a run with %d rank(s), this one has %d: networks, optimizers, premium buffer and "
@@ -160,6 +164,7 @@ class KirasRunner(OnPolicyRunner):
         scalars = self.alg.update()
         self._renew_skill_probabilities(scalars)
         learned = time.perf_counter()
+        self._check_update(scalars)
         self.current_learning_iteration += 1
         steps = self.env.num_envs * self.cfg["num_steps_per_env"] * distributed.size()
         self.steps += steps
@@ -217,11 +222,19 @@ class KirasRunner(OnPolicyRunner):
             check_nan(obs, self.alg.storage.rewards, self.alg.storage.dones)
         except ValueError as error:
             fault = str(error)
+        self._stop_at(fault, "Worlds that diverge are reset before this, so look at your own terms")
+
+    def _check_update(self, scalars: dict[str, float]) -> None:
+        """Refuse weights that are no numbers: worlds they break are reset, and look sound."""
+        broken = [k for k, v in scalars.items() if k.startswith(LOSSES) and not math.isfinite(v)]
+        fault = f"{', '.join(broken)} not finite." if broken else ""
+        self._stop_at(fault, "Look at the learning rates of learner")
+
+    def _stop_at(self, fault: str, advice: str) -> None:
         if distributed.any_rank(bool(fault)):
             raise TrainingError(
                 f"iteration {self.current_learning_iteration + 1}: "
-                f"{fault or 'Another rank met values that are not finite.'} Worlds that diverge "
-                "are reset before this, so look at your own terms or lower "
+                f"{fault or 'Another rank met values that are not finite.'} {advice}, or lower "
                 "learner.ppo.learning_rate; "
                 f"the last checkpoint stays as it is ({self.run_dir})"
             )

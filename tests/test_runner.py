@@ -14,7 +14,7 @@ from kiras_rl.config import list_configs, load_config
 from kiras_rl.envs import make_env
 from kiras_rl.phases import FINETUNING, SKILL_LEARNING, phase_config
 from kiras_rl.process import StopRequest
-from kiras_rl.runner import Evaluators, KirasRunner
+from kiras_rl.runner import Evaluators, KirasRunner, TrainingError
 
 # Noise, randomization and delay are on; episodes and premium windows end many times.
 TINY = (
@@ -202,6 +202,17 @@ def test_without_a_folder_nothing_is_written(tmp_path):
     config = load_config("solo8", [*TINY, "iterations=1"])
     KirasRunner(make_env(config), config, None, "cpu").learn()
     assert list(tmp_path.iterdir()) == []
+
+
+def test_an_update_that_leaves_no_numbers_ends_the_run(make_runner):
+    runner = make_runner("broken")
+    runner.learn(1)
+    before = latest(runner).read_bytes()
+    weight = next(runner.alg.estimation.estimator.parameters())
+    weight.data.view(-1)[0] = math.nan
+    with pytest.raises(TrainingError, match=r"iteration 2: .*not finite"):
+        runner.learn()
+    assert latest(runner).read_bytes() == before
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

@@ -53,8 +53,8 @@ def check_fit(path: Path, content: dict, runner: KirasRunner) -> None:
         CheckpointError: At the first difference.
     """
     given, wanted = _properties(content["description"]), _properties(runner.describe_policy())
-    given |= _sizes(content["best_networks"])
-    wanted |= _sizes(runner.alg.networks())
+    given |= sizes(content["best_networks"])
+    wanted |= sizes(runner.alg.networks())
     for name in given | wanted:
         if given.get(name) != wanted.get(name):
             raise CheckpointError(
@@ -69,7 +69,7 @@ def _properties(description: dict) -> dict:
     return {name: value for name, value in values.items() if name not in FREE}
 
 
-def _sizes(networks: dict) -> dict[str, list[tuple[int, ...]]]:
+def sizes(networks: dict) -> dict[str, list[tuple[int, ...]]]:
     """Return the shapes of all weights of each network."""
     return {
         f"sizes of the {name}": [tuple(weight.shape) for weight in weights.values()]

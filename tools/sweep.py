@@ -27,7 +27,7 @@ from kiras_rl.config import (
     config_to_dict,
     load_config,
 )
-from kiras_rl.phases import phases_of, total_iterations
+from kiras_rl.phases import SKILL_LEARNING, total_iterations
 from kiras_rl.process import StopRequest
 from kiras_rl.runner import KirasRunner
 from kiras_rl.schema import Config
@@ -39,6 +39,7 @@ from kiras_rl.tools.training import (
     check,
     console,
     is_finished,
+    message_of,
     resume,
     train_run,
 )
@@ -302,7 +303,7 @@ def train_sweep(runs: list[Run]) -> Report:
             try:
                 done += _train(run, stop)
             except MISTAKES as error:
-                print(f"error: {run.name}: {error}", file=sys.stderr)
+                print(f"error: {run.name}: {message_of(error)}", file=sys.stderr)
                 failures.add(run.name)
     return Report(runs, failures, stop.requested and done + len(failures) < len(runs))
 
@@ -312,8 +313,7 @@ def _try_out(runs: list[Run]) -> None:
     for label, config in {run.label: run.config for run in runs}.items():
         try:
             check(config)
-            for phase in phases_of(config):
-                build(config, None, phase, num_envs=1)
+            build(config, None, SKILL_LEARNING, num_envs=1)
         except MISTAKES as error:
             raise ConfigError(f"{label}: {error}") from None
 

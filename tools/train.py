@@ -10,13 +10,15 @@ import shutil
 import sys
 from pathlib import Path
 
+import torch
+
 from kiras_rl import distributed
 from kiras_rl.checkpoint import FLAT, FOLDER, LATEST, find_checkpoint
 from kiras_rl.config import ConfigError, list_configs, load_config
 from kiras_rl.process import StopRequest
 from kiras_rl.runner import KirasRunner
 from kiras_rl.tools.sweep import list_sweeps, load_sweep, train_sweep
-from kiras_rl.tools.training import MISTAKES, begin, console, resume, train_run
+from kiras_rl.tools.training import MISTAKES, begin, console, message_of, resume, train_run
 
 DESCRIPTION = """\
 Train one policy for all skills of a robot.
@@ -55,8 +57,9 @@ def main(argv: list[str] | None = None) -> int:
         with distributed.group():
             return _train(args)
     except MISTAKES as error:
-        if distributed.local_rank() == 0:  # the others of a machine make the same
-            print(f"error: {error}", file=sys.stderr)
+        # The others of a machine make the same, but for what their disk or GPU refuses.
+        if distributed.local_rank() == 0 or isinstance(error, (OSError, torch.OutOfMemoryError)):
+            print(f"error: {message_of(error)}", file=sys.stderr)
         return 2
     except distributed.RankLostError as error:
         print(
@@ -143,10 +146,11 @@ def _new_run_dir(runs: Path, cfg: str) -> Path:
 
 def claim(folder: Path) -> Path:
     """Make a new folder; where one is there, of a run begun in the same second, add a number."""
+    folder.parent.mkdir(parents=True, exist_ok=True)
     name, number = folder.name, 1
     while True:
         try:
-            folder.mkdir(parents=True)
+            folder.mkdir()
             return folder
         except FileExistsError:
             number += 1

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from contextlib import suppress
+import copy
+import re
 from dataclasses import asdict
 from pathlib import Path
 
@@ -27,19 +28,36 @@ from kiras_rl.runner import KirasRunner, TrainingError
 from kiras_rl.schema import Config
 from kiras_rl.tools.curves import draw_curves
 from kiras_rl.tools.evaluator import check_terrain, make_evaluators, onboard_policy
-from kiras_rl.tools.flat_policy import check_fit, read_flat
+from kiras_rl.tools.flat_policy import check_fit, read_flat, sizes
 from kiras_rl.tools.progress import Progress
 from kiras_rl.tools.protocols import flat, terrain
 from kiras_rl.tools.report.terminal import as_rich
 from kiras_rl.tools.source import source_commit
 
-MISTAKES = (CheckpointError, ConfigError, ExportError, PolicyError, RobotError, TrainingError)
-"""Errors whose message is all that a user needs."""
+MISTAKES = (
+    CheckpointError,
+    ConfigError,
+    ExportError,
+    OSError,
+    PolicyError,
+    RobotError,
+    TrainingError,
+    torch.OutOfMemoryError,
+)
+"""Errors whose message is all that a user needs; a full disk or GPU is one."""
 
 CONFIG, POLICY = "config.yaml", "policy.onnx"
 """Files of a run; the second one is the last that is written."""
 
 console = Console()
+
+
+def message_of(error: Exception) -> str:
+    """Return the one line that a user reads of a mistake."""
+    line = " ".join(str(error).split())
+    if isinstance(error, torch.OutOfMemoryError):
+        line += " Fewer worlds need less: lower num_envs"
+    return line
 
 
 # --- a learner -----------------------------------------------------------------------------------
@@ -81,6 +99,11 @@ def resume(source: Path, overrides: list[str]) -> KirasRunner:
     check_resume_overrides(overrides)
     run_dir, (values, phase) = _run_of(source), distributed.from_main(lambda: _read_run(source))
     config = config_from_dict(values, overrides)
+    if phase == FINETUNING and config.iterations != values["iterations"]:
+        raise ConfigError(
+            f"iterations={config.iterations}: the skill learning of this run is over, after "
+            f"{values['iterations']}; finetuning.iterations may change"
+        )
     check(config)
     runner = build(config, run_dir, phase)
     runner.load(str(source))
@@ -96,10 +119,33 @@ def check(config: Config) -> None:
     """Refuse now what a later phase could not use, not after hours of training.
 
     Raises:
-        ConfigError: Terrain that cannot be.
+        ConfigError: Terrain, terms or networks of finetuning that cannot be.
     """
-    if config.finetuning:
-        check_terrain(config)
+    if config.finetuning is None:
+        return
+    check_terrain(config)
+    alone = phase_config(config, FINETUNING)
+    resolve_backend(alone.sim.backend, torch.device(resolve_device(config.device)))
+    before = networks_of(config, SKILL_LEARNING)
+    try:
+        after = networks_of(config, FINETUNING)
+    except (ConfigError, PolicyError) as error:
+        raise ConfigError(f"finetuning: {error}") from None
+    for name, shapes in before.items():
+        if after.get(name) != shapes:
+            raise ConfigError(
+                f"finetuning: other {name} than in skill learning, which it goes on from: leave "
+                "finetuning.learner and finetuning.env.observations without what changes them"
+            )
+
+
+def networks_of(config: Config, phase: str) -> dict[str, list[tuple[int, ...]]]:
+    """Return the shapes of the weights of a phase's networks; it is tried out with one world."""
+    trial = copy.deepcopy(config)
+    trial.device, trial.sim.backend = "cpu", "auto"
+    if trial.finetuning:
+        trial.finetuning.sim |= {"backend": "auto"}
+    return sizes(build(trial, None, phase, num_envs=1).alg.networks())
 
 
 def _run_of(source: Path) -> Path:
@@ -146,11 +192,22 @@ def resolve_device(name: str) -> str:
     """
     if name == "auto":
         name = "cuda" if torch.cuda.is_available() else "cpu"
-    if name.split(":")[0] not in ("cpu", "cuda"):
-        raise ConfigError(f"device={name}: allowed are auto, cpu, cuda")
-    if name.startswith("cuda") and not torch.cuda.is_available():
+    if not re.fullmatch(r"cpu|cuda(:\d+)?", name):
+        raise ConfigError(f"device={name}: allowed are auto, cpu, cuda, cuda:N")
+    if name == "cpu":
+        return name
+    if not torch.cuda.is_available():
         raise ConfigError(f"device={name}: torch finds no CUDA device here; set device=cpu")
-    return name if name == "cpu" or distributed.size() == 1 else _device_of_rank(name)
+    return _device_of_rank(name) if distributed.size() > 1 else _current_device(name)
+
+
+def _current_device(name: str) -> str:
+    """Make a CUDA device the current one: graphs and random numbers are those of that one."""
+    index, devices = torch.device(name).index or 0, torch.cuda.device_count()
+    if index >= devices:
+        raise ConfigError(f"device={name}: there are cuda:0 to cuda:{devices - 1} here")
+    torch.cuda.set_device(index)
+    return name
 
 
 def _device_of_rank(name: str) -> str:
@@ -223,12 +280,14 @@ def _next_phase(before: KirasRunner) -> KirasRunner:
     runner = build(before.config, before.run_dir, FINETUNING)
     runner.begin_from(folder / checkpoint.LATEST)
     distributed.from_main(lambda: _keep_flat(folder))
+    runner.save_latest()  # from here on the run goes on in this phase
     return runner
 
 
 def _keep_flat(folder: Path) -> None:
-    with suppress(FileNotFoundError):
-        (folder / checkpoint.BEST).replace(folder / checkpoint.FLAT)
+    best = folder / checkpoint.BEST
+    if best.exists() and checkpoint.load_checkpoint(best)["phase"] == SKILL_LEARNING:
+        best.replace(folder / checkpoint.FLAT)
 
 
 def _announce(runner: KirasRunner) -> None:

@@ -30,6 +30,9 @@ from kiras_rl.recorded import Recorded
 from kiras_rl.schedules import advantage_weights, piecewise_linear
 from kiras_rl.schema import LearnerConfig
 
+FULL_STEPS_STD = 0.5
+"""Action noise from which on the estimator takes steps of the configured size."""
+
 TASK, IMITATION = 0, 1  # reward groups
 
 
@@ -241,12 +244,11 @@ class KirasPPO(PPO):
         A step of the estimator changes what the actor is told, and so its actions, past PPO's trust
         region: by a KL divergence that grows as the noise falls. So its step size falls with it.
         """
-        schedule = self.config.ppo.action_std
-        std = piecewise_linear(schedule, self.progress)
+        std = piecewise_linear(self.config.ppo.action_std, self.progress)
         self.actor.distribution.std_param.fill_(std)
         self.desired_kl.fill_(piecewise_linear(self.config.ppo.desired_kl, self.progress))
         if self.estimation:
-            self.estimation.scale_steps(std / max(value for _, value in schedule))
+            self.estimation.scale_steps(min(1.0, std / FULL_STEPS_STD))
 
     # --- skills ---------------------------------------------------------------------------------
 
@@ -316,7 +318,8 @@ class KirasPPO(PPO):
             self.estimation.estimator.load_state_dict(networks["estimator"])
         if self.reference:
             self.reference.policy.load_state_dict(self.policy().state_dict())
-        self.learning_rate.fill_(learner["learning_rate"])
+        limits = self.config.ppo.learning_rate_range
+        self.learning_rate.fill_(learner["learning_rate"]).clamp_(*limits)
         if self.sampler and "skill_probabilities" in learner:
             self.sampler.probabilities = learner["skill_probabilities"].to(self.device)
         self._apply_schedules()

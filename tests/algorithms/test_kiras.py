@@ -58,6 +58,15 @@ def test_the_estimator_takes_smaller_steps_as_the_action_noise_falls(make_runner
     assert rates == pytest.approx([0.01, 0.006, 0.002])  # noise: 0.5, 0.3, 0.1
 
 
+@pytest.mark.parametrize(("std", "rate"), [(0.1, 0.002), (0.8, 0.01)])
+def test_what_the_rest_of_a_schedule_holds_does_not_matter_to_the_estimator(make_runner, std, rate):
+    alg = make_runner(
+        f"learner.ppo.action_std=[[0,{std}],[1,0.05]]", "learner.estimator.learning_rate=0.01"
+    ).alg
+    rates = [group["lr"].item() for group in alg.estimation.optimizer.param_groups]
+    assert rates == pytest.approx([rate])
+
+
 @pytest.mark.parametrize("without", [(), *[(part,) for part in PARTS], PARTS], ids="-".join)
 def test_it_trains_whatever_is_left_out(make_runner, without):
     runner, seen = make_runner(*null(*without)), []

@@ -105,7 +105,8 @@ def test_a_sweep_stops_goes_on_and_grows(tmp_path, capsys, interrupt):
     before = contents(sweep / "kiras")
 
     # one more configuration, which breaks; a key of the machine may change
-    broken = "{cfg: smoke, overrides: [env.rewards.terms.torques.weight=.nan]}"
+    overrides = "[learner.estimator.learning_rate=1e30, learner.estimator.adaboot=off]"
+    broken = f"{{cfg: smoke, overrides: {overrides}}}"
     write(tmp_path / "a.yaml", f"{{broken: {broken}, {configs[1:-1]}}}", "[1]")
     interrupt(0)  # never
     assert main([*shlex.split(last.partition("kiras-train ")[2]), "sim.threads=1"]) == 1

@@ -17,6 +17,7 @@ from kiras_rl.checkpoint import find_checkpoint, load_checkpoint, load_policy, s
 from kiras_rl.config import load_config
 from kiras_rl.deploy.policy import OnboardPolicy
 from kiras_rl.tools.curves import read_scalars
+from kiras_rl.tools.progress import Progress
 from kiras_rl.tools.train import claim, main
 
 
@@ -83,6 +84,35 @@ def test_two_runs_begun_at_once_get_two_folders(tmp_path):
     assert all(folder.is_dir() for folder in (first, second, third))
 
 
+def test_a_folder_for_runs_that_cannot_be_made_is_refused(tmp_path):
+    (tmp_path / "runs").symlink_to(tmp_path / "not_mounted")
+    with pytest.raises(FileExistsError):
+        claim(tmp_path / "runs" / "12-00-00")
+
+
+def test_a_finetuning_that_broke_before_its_first_checkpoint_goes_on(tmp_path, monkeypatch):
+    keep = ["--cfg", "smoke", "--runs", str(tmp_path), "checkpoint_minutes=999"]
+
+    def broken(self, status):
+        if status.iteration == 3 and status.phase == "finetuning":
+            raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(Progress, "show", broken)
+        main([*keep, "finetuning.iterations=3", "evaluation.interval=1"])
+    checkpoints = only_run(tmp_path, "smoke") / "checkpoints"
+    assert load_checkpoint(checkpoints / "best.pt")["phase"] == "finetuning"
+    flat = (checkpoints / "flat.pt").read_bytes()
+    assert main(["--resume", str(checkpoints.parent)]) == 0
+    assert (checkpoints / "flat.pt").read_bytes() == flat
+    assert load_checkpoint(checkpoints / "latest.pt")["iteration"] == 5
+
+
+def test_skill_learning_cannot_be_lengthened_when_it_is_over(smoke, capsys):
+    message = refusal(capsys, "--resume", str(smoke), "iterations=5")
+    assert "iterations=5: the skill learning of this run is over, after 2" in message
+
+
 def test_a_checkpoint_outside_of_a_run_is_not_resumed(smoke, tmp_path, capsys):
     stray = tmp_path / "latest.pt"
     stray.write_bytes((smoke / "checkpoints" / "latest.pt").read_bytes())
@@ -134,6 +164,12 @@ def refusal(capsys, *argv):
         (["--cfg", "smoke", "evaluation.terrain.level=2"], "terrain.level=2: allowed are 0 to 1"),
         (["--cfg", "smoke", "finetuning.env.terrain.types.hills={}"], "no term 'hills'"),
         (["--cfg", "smoke", "finetuning.learner.ppo.gama=1"], "did you mean 'learner.ppo.gamma'?"),
+        (["--cfg", "smoke", "finetuning.env.rewards.terms.tork={weight: 1}"], "no term 'tork'"),
+        (["--cfg", "smoke", "finetuning.env.action_clip=0"], "finetuning: policy metadata: action"),
+        (["--cfg", "smoke", "finetuning.sim.backend=x"], "allowed are auto, native, warp"),
+        (["--cfg", "smoke", "finetuning.learner.ppo.actor_dims=[8]"], "other sizes of the actor"),
+        (["--cfg", "smoke", "finetuning.learner.estimator=null"], "than in skill learning"),
+        (["--cfg", "smoke", "device=cpu:x"], "allowed are auto, cpu, cuda, cuda:N"),
         (["--resume", "runs/nothing"], "does not exist: give a run folder or a checkpoint file"),
     ],
 )

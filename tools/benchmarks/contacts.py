@@ -55,9 +55,11 @@ def measure(request: Request) -> Figures:
     """Collide all poses under every setting, in turns.
 
     Raises:
-        ConfigError: Flat tiles alone, which have no height field.
+        ConfigError: No finetuning, or flat tiles alone, which have no height field.
         RobotError: No such robot.
     """
+    if request.config.finetuning is None:
+        raise ConfigError("finetuning=null: this configuration has no terrain to measure")
     config = phase_config(request.config, FINETUNING)
     robot, library = load_robot(config.robot), build_library(config.env.terrain)
     if not (library.grid > 0).any():

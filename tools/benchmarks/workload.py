@@ -154,7 +154,9 @@ def bare_warp_steps(
         m.opt.warn_overflow = 0
         memory = {"nconmax": sim.max_contacts, "njmax": sim.max_constraints}
         data = mjw.make_data(model, n, **memory)
-        begin = {name: state["sim"][name] for name in ("qpos", "qvel", "ctrl", "qacc_warmstart")}
+        begin = {
+            name: state["sim"][name] for name in ("time", "qpos", "qvel", "ctrl", "qacc_warmstart")
+        }
         if "history" in state["sim"]:
             begin["history"] = state["sim"]["history"].flatten(1)
         bound = {name: wp.to_torch(getattr(data, name)) for name in begin}
