@@ -28,7 +28,7 @@ from kiras_rl.tools.evaluator import (
     trained_config,
 )
 from kiras_rl.tools.ground import Terrain
-from kiras_rl.tools.policy_files import load_policy
+from kiras_rl.tools.policy_files import load_policy, robot_of
 
 DESCRIPTION = """\
 Record episodes of a policy, without action noise, as a dataset: base, joints, torques, contacts,
@@ -94,7 +94,7 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
         metavar="V_X[,V_Y[,YAW]]",
         help="m/s, m/s, rad/s; each a number or a range LOW:HIGH to draw from (0.3)",
     )
-    parser.add_argument("--seed", type=int, default=0, help="of robots and commands (0)")
+    parser.add_argument("--seed", type=_seed, default=0, help="of robots and commands (0)")
     parser.add_argument("--nominal", action="store_true", help="no randomization, noise or pushes")
     parser.add_argument(
         "--terrain", default="flat", metavar="TYPE[:LEVEL]", help="the heading is held there (flat)"
@@ -111,7 +111,7 @@ def _collect(args: argparse.Namespace, line: str) -> Dataset:
     config, terrain = _ground(trained_config(metadata), args.terrain)
     config = evaluation_physics(config, args.nominal)
     plan = Plan(skills, args.episodes, args.duration, args.command, args.seed, terrain)
-    env = make_evaluation_env(config, plan.num_envs, plan.duration)
+    env = make_evaluation_env(config, plan.num_envs, plan.duration, robot=robot_of(metadata))
     dataset = collect(env, onboard_policy(onboard), plan, _provenance(args, metadata, line))
     save_dataset(dataset, args.out, formats)
     return dataset
@@ -188,6 +188,12 @@ def _command(text: str) -> tuple[Range, ...]:
 def _count(text: str) -> int:
     if not text.isdecimal() or int(text) < 1:
         raise argparse.ArgumentTypeError(f"'{text}': give a whole number, at least 1")
+    return int(text)
+
+
+def _seed(text: str) -> int:
+    if not text.isdecimal():
+        raise argparse.ArgumentTypeError(f"'{text}': give a whole number, at least 0")
     return int(text)
 
 

@@ -9,13 +9,13 @@ from pathlib import Path
 from kiras_rl.config import ConfigError
 from kiras_rl.tools.evaluate import (
     add_options,
+    chosen,
     console,
-    default_protocols,
     exit_code,
     measure,
     options_of,
 )
-from kiras_rl.tools.protocols import PROTOCOLS, known
+from kiras_rl.tools.protocols import PROTOCOLS
 from kiras_rl.tools.protocols.pooling import pool
 from kiras_rl.tools.protocols.subject import Options, Subject
 from kiras_rl.tools.report.about import about_table
@@ -94,12 +94,9 @@ def _split(source: str) -> tuple[str, Path]:
 def compare(methods: dict[str, list[Subject]], names: list[str] | None, out: Path) -> Path:
     """Measure what is missing and write the report after each protocol; return its page."""
     subjects = [subject for group in methods.values() for subject in group]
-    if names is None:
-        wanted = {name for subject in subjects for name in default_protocols(subject)}
-        names = known(wanted, subjects)
     sections: list[Section] = []
     page = out
-    for name, values in measure(subjects, names):
+    for name, values in measure(subjects, chosen(names, subjects)):
         rest = iter(values)
         results = {label: pool([next(rest) for _ in group]) for label, group in methods.items()}
         sections.append(PROTOCOLS[name].section(results))

@@ -12,8 +12,8 @@ from numpy.typing import ArrayLike
 from kiras_rl.deploy.metadata import Posture
 from kiras_rl.deploy.policy import OnboardPolicy, PolicyError, PolicyMetadata, projected_gravity
 from kiras_rl.envs.terrains import CROSSED
-from kiras_rl.robots.robot import Robot, RobotError, load_robot
 from kiras_rl.tools.ground import FLAT, Terrain, Tile, ground_height, terrain_of
+from kiras_rl.tools.policy_files import check_joints, robot_of
 
 _CONTACT_FORCE = 1.0  # N; less is a graze
 _FALL_COSINE = np.cos(np.deg2rad(60.0))  # gravity this far from the posture: not recoverable
@@ -82,8 +82,7 @@ class Driver:
         """
         self.policy = policy
         meta = self.metadata
-        self.robot = load_robot(meta.robot)
-        _check_joints(self.robot, meta)
+        self.robot = robot_of(meta)
         self._terrain = terrain
         self._build(FLAT)
         self.substeps = round(1 / (meta.control_rate * self.model.opt.timestep))
@@ -97,7 +96,7 @@ class Driver:
         if not tile.is_flat:
             self.terrain.build(spec, tile)
         self.tile, self.spec = tile, spec
-        self.model = _build_model(spec, self.metadata)
+        self.model = spec.compile()
         self.data = mujoco.MjData(self.model)
         self._feet = np.array([self.model.geom(name).id for name in self.robot.foot_geoms])
         self._base = np.array([self.model.geom(name).id for name in self.robot.base_geoms])
@@ -200,7 +199,7 @@ class Driver:
         Raises:
             RobotError: If the other robot has other joints.
         """
-        _check_joints(other.robot, self.metadata)
+        check_joints(other.robot, self.metadata)
         self.data.qpos[:], self.data.qvel[:] = other.data.qpos, other.data.qvel
         self.data.ctrl[:] = other.data.ctrl
         mujoco.mj_forward(self.model, self.data)
@@ -280,24 +279,6 @@ class Driver:
         """Whether gravity is far from the posture asked for and from the one before it."""
         wanted = self._gravity[[self._skill, self._previous]]
         return bool((wanted @ projected_gravity(quat)).max() < _FALL_COSINE)
-
-
-def _check_joints(robot: Robot, metadata: PolicyMetadata) -> None:
-    if robot.joint_names != metadata.joint_names:
-        raise RobotError(
-            f"the policy was trained for the joints {', '.join(metadata.joint_names)}, "
-            f"but robot '{robot.name}' has {', '.join(robot.joint_names)}"
-        )
-
-
-def _build_model(spec: mujoco.MjSpec, metadata: PolicyMetadata) -> mujoco.MjModel:
-    model = spec.compile()
-    limit = np.array(metadata.torque_limit)
-    model.actuator_gainprm[:, 0] = metadata.kp
-    model.actuator_biasprm[:, 1] = -np.array(metadata.kp)
-    model.actuator_biasprm[:, 2] = -np.array(metadata.kd)
-    model.actuator_forcerange[:] = np.stack([-limit, limit], axis=1)
-    return model
 
 
 def _pitched(pitch: float) -> tuple[float, float, float, float]:

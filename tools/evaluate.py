@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -13,6 +14,7 @@ from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, T
 from kiras_rl.checkpoint import CheckpointError
 from kiras_rl.config import ConfigError
 from kiras_rl.deploy.metadata import PolicyError
+from kiras_rl.evaluation.flat import SETTLE
 from kiras_rl.robots.robot import RobotError
 from kiras_rl.tools.protocols import PROTOCOLS, known
 from kiras_rl.tools.protocols.subject import Options, Subject
@@ -45,8 +47,8 @@ examples:
   kiras-evaluate policy.onnx --protocol heat_map   an hour or two on two CPU cores
 """
 
-MISTAKES = (CheckpointError, ConfigError, PolicyError, RobotError)
-"""Errors whose message is all that a user needs."""
+MISTAKES = (CheckpointError, ConfigError, OSError, PolicyError, RobotError)
+"""Errors whose message is all that a user needs; what a file or folder refuses is one."""
 
 ALL = list(PROTOCOLS)
 
@@ -59,8 +61,7 @@ def main(argv: list[str] | None = None) -> int:
 
     def work() -> None:
         subject = Subject.load(args.policy, args.robot, args.out, options_of(args))
-        names = args.protocol or default_protocols(subject)
-        evaluate(subject, known(names, [subject]) if names == ALL else names)
+        evaluate(subject, chosen(args.protocol, [subject]))
 
     return exit_code(work)
 
@@ -128,12 +129,21 @@ def _bar() -> Progress:
     )
 
 
-def default_protocols(subject: Subject) -> list[str]:
-    """Return what is measured of a policy where the user names nothing."""
+def chosen(names: list[str] | None, subjects: list[Subject]) -> list[str]:
+    """Return the protocols to measure: those named, else what makes sense for the policies.
+
+    Args:
+        names: Given by the user; what they name is measured, or refused with a reason.
+        subjects: All that is measured.
+    """
+    if names and names != ALL:
+        return names
+    return known(names or _defaults(subjects), subjects)
+
+
+def _defaults(subjects: list[Subject]) -> list[str]:
     names = ["flat", "imitation", "transitions", "sampling", "learning"]
-    if subject.is_finetuned:
-        names.append("terrain")
-    return known(names, [subject])
+    return names + ["terrain"] * any(subject.is_finetuned for subject in subjects)
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -146,7 +156,9 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "--robots", type=_count, default=default.robots,
         help="robots a skill (flat, imitation, robustness)",
     )  # fmt: skip
-    parser.add_argument("--duration", type=float, default=default.duration, help="s a robot (flat)")
+    parser.add_argument(
+        "--duration", type=_duration, default=default.duration, help="s a robot (flat)"
+    )
     parser.add_argument("--trials", type=_count, help="of a cell (the others)")
     parser.add_argument(
         "--levels", type=_levels, default=default.levels, help="of terrain, 0 to 10, as in 2,4,6"
@@ -194,6 +206,18 @@ def _count(text: str) -> int:
     if not text.isdigit() or int(text) < 1:
         raise argparse.ArgumentTypeError(f"'{text}': give a number of at least 1")
     return int(text)
+
+
+def _duration(text: str) -> float:
+    try:
+        seconds = float(text)
+    except ValueError:
+        seconds = math.nan
+    if not SETTLE < seconds < math.inf:
+        raise argparse.ArgumentTypeError(
+            f"'{text}': give seconds, more than the first {SETTLE:g}, which is not counted"
+        )
+    return seconds
 
 
 def _levels(text: str) -> tuple[int, ...]:

@@ -22,7 +22,7 @@ from kiras_rl.evaluation.terrain import (
 )
 from kiras_rl.interfaces import HISTORY, PROPRIO
 from kiras_rl.phases import FINETUNING, phase_config
-from kiras_rl.robots.robot import load_robot
+from kiras_rl.robots.robot import Robot, load_robot
 from kiras_rl.runner import Evaluators
 from kiras_rl.schema import Config
 
@@ -41,15 +41,23 @@ def trained_config(metadata: PolicyMetadata) -> Config:
     return config_from_dict(metadata.provenance["config"])
 
 
+def standard_config(robot: str) -> Config:
+    """Return the configuration of a robot's own name, else `base`."""
+    return load_config(robot if robot in list_configs() else "base")
+
+
 def evaluation_physics(config: Config, nominal: bool) -> Config:
-    """Return a policy's configuration with its robot's standard randomization, or with none.
+    """Return a policy's configuration with what is its robot's standard, whatever it trained with.
+
+    That is the randomization, or none, and what counts as a fall.
 
     Args:
         config: Of one phase; it is changed.
         nominal: No randomization, sensor noise or pushes.
     """
-    standard = load_config(config.robot if config.robot in list_configs() else "base").env
+    standard = standard_config(config.robot).env
     config.env.randomization = standard.randomization
+    config.env.terminations = standard.terminations
     config.env.observations.noise = not nominal
     config.env.skills = standard.skills
     if nominal:
@@ -60,13 +68,25 @@ def evaluation_physics(config: Config, nominal: bool) -> Config:
 
 
 def make_evaluation_env(
-    config: Config, num_envs: int, duration: float, device: str = "cpu"
+    config: Config,
+    num_envs: int,
+    duration: float,
+    device: str = "cpu",
+    robot: Robot | None = None,
 ) -> QuadrupedEnv:
-    """Build an environment with the run's physics, in which no trial is cut short."""
+    """Build an environment with the run's physics, in which no trial is cut short.
+
+    Args:
+        config: Of one phase.
+        num_envs: Worlds.
+        duration: Of a trial, s.
+        device: Of the simulation.
+        robot: The robot, if not the configuration's: a policy's, see `policy_files.robot_of`.
+    """
     config = copy.deepcopy(config)
     config.env.terminations.episode_length = duration + 1.0
     config.env.terminations.random_first_length = False
-    return make_env(config, device, num_envs)
+    return make_env(config, device, num_envs, robot)
 
 
 def make_evaluators(config: Config, phase: str, device: str) -> Evaluators:

@@ -5,12 +5,15 @@ Without torch, unless a checkpoint has to be exported.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
-from kiras_rl.deploy.policy import OnboardPolicy, PolicyError
-from kiras_rl.robots.robot import load_robot
+import numpy as np
+
+from kiras_rl.deploy.policy import OnboardPolicy, PolicyError, PolicyMetadata
+from kiras_rl.robots.robot import Keyframe, Robot, RobotError, load_robot
 
 if TYPE_CHECKING:
     from kiras_rl.export import ExportReport
@@ -43,6 +46,42 @@ def load_policy(source: Path | None, robot: str | None = None) -> OnboardPolicy:
             f"--robot {robot} was given, but {source} is a policy of {policy.metadata.robot}"
         )
     return policy
+
+
+def robot_of(metadata: PolicyMetadata) -> Robot:
+    """Return a policy's robot as it was in training, whatever its folder says today.
+
+    Keyframes, default pose, gains, torque limits and action scales are those of the policy file.
+
+    Raises:
+        RobotError: If the robot of the policy is unknown or has other joints.
+    """
+    robot = load_robot(metadata.robot)
+    check_joints(robot, metadata)
+    arrays = ("default_joint_pos", "kp", "kd", "torque_limit", "action_scale")
+    return replace(
+        robot,
+        keyframes=tuple(_keyframe(metadata, skill) for skill in metadata.skills),
+        **{name: np.array(getattr(metadata, name)) for name in arrays},
+    )
+
+
+def check_joints(robot: Robot, metadata: PolicyMetadata) -> None:
+    """Refuse a policy of other joints.
+
+    Raises:
+        RobotError: If the robot has other joints than the policy.
+    """
+    if robot.joint_names != metadata.joint_names:
+        raise RobotError(
+            f"the policy was trained for the joints {', '.join(metadata.joint_names)}, "
+            f"but robot '{robot.name}' has {', '.join(robot.joint_names)}"
+        )
+
+
+def _keyframe(metadata: PolicyMetadata, skill: str) -> Keyframe:
+    posture = metadata.keyframes[skill]
+    return Keyframe(skill, posture.base_height, posture.pitch, np.array(posture.joint_pos))
 
 
 def shipped_policy(robot: str) -> Path:

@@ -142,23 +142,29 @@ def summarize(recording: Recording, env: SkillEnv) -> dict[str, SkillResult]:
 
 def per_robot(recording: Recording, env: SkillEnv) -> dict[str, torch.Tensor]:
     """Return the fields of SkillResult for each robot, (N,) each."""
-    start = round(SETTLE / recording.step_dt)
-    alive = recording.alive[start:].float()
-    velocity = recording.velocity[start:]
+    counted = _counted(recording.alive, round(SETTLE / recording.step_dt))
+    weight, velocity = counted.float(), recording.velocity
     values = {
-        "height": mean_where(recording.height[start:], alive),
-        "pitch": mean_where(recording.pitch[start:], alive),
-        "velocity": mean_where(velocity, alive),
-        "velocity_error": mean_where((velocity - recording.command[:, 0]).abs(), alive),
-        "lifts": lifts_per_second(
-            recording.contact[start:], recording.alive[start:], recording.step_dt
-        ).amin(dim=-1),
+        "height": mean_where(recording.height, weight),
+        "pitch": mean_where(recording.pitch, weight),
+        "velocity": mean_where(velocity, weight),
+        "velocity_error": mean_where((velocity - recording.command[:, 0]).abs(), weight),
+        "lifts": lifts_per_second(recording.contact, counted, recording.step_dt).amin(dim=-1),
         "falls": 1.0 - recording.alive[-1].float(),
     }
     errors = posture_errors(recording.height, recording.pitch, recording.skill, env)
     for name, error in zip(("height_error", "pitch_error"), errors, strict=True):
-        values[name] = mean_where(error[start:], alive)
+        values[name] = mean_where(error, weight)
     return values | {"distinct": _distinct(values["height"], values["pitch"], recording, env)}
+
+
+def _counted(alive: torch.Tensor, start: int) -> torch.Tensor:
+    """Return the steps that count, (T, N): from `start` on until a fall.
+
+    Of a robot that fell before, those until its fall: what comes after is another life.
+    """
+    settled = torch.arange(len(alive), device=alive.device)[:, None] >= start
+    return alive & (settled | ~alive[start : start + 1].any(dim=0))
 
 
 def posture_errors(
@@ -191,10 +197,10 @@ def lifts_per_second(contact: torch.Tensor, alive: torch.Tensor, step_dt: float)
 
     Args:
         contact: (T, N, F) bool.
-        alive: Steps before the fall, (T, N) bool.
+        alive: Steps that count, all before the fall, (T, N) bool.
         step_dt: s.
     """
-    lifted = contact[:-1] & ~contact[1:] & alive[1:, :, None]
+    lifted = contact[:-1] & ~contact[1:] & (alive[:-1] & alive[1:])[:, :, None]
     return lifted.sum(dim=0) / (alive.sum(dim=0).clamp(min=1)[:, None] * step_dt)
 
 
@@ -224,7 +230,7 @@ def as_scalars(results: dict[str, SkillResult]) -> dict[str, float]:
 
 
 def mean_where(signal: torch.Tensor, alive: torch.Tensor) -> torch.Tensor:
-    """Average (T, N) over the steps that count; 0 steps give the value at the start."""
+    """Average (T, N) over the steps that count; 0 steps give the value of the first one."""
     count = alive.sum(dim=0)
     mean = torch.where(alive > 0, signal, 0.0).sum(dim=0) / count.clamp(min=1.0)
     return torch.where(count > 0, mean, signal[0])

@@ -104,6 +104,18 @@ def test_a_robot_that_falls_at_once_still_has_numbers(recording):
         assert all(torch.isfinite(torch.tensor(x)) for x in dataclasses.astuple(result))
 
 
+def test_a_robot_that_falls_in_the_first_second_counts_until_its_fall(recording):
+    recording.alive[5:, 0] = False
+    recording.velocity[:5, 0] = 0.1
+    recording.velocity[5:, 0], recording.height[5:, 0] = 0.3, 9.0  # its next life
+    recording.pitch[:, 2] = 0.2  # the other robot of the skill
+    low = summarize(recording, KEYFRAMES)["low"]
+    assert (low.velocity, low.velocity_error) == pytest.approx((0.2, 0.1))
+    assert (low.height, low.height_error) == pytest.approx((0.2, 0.0), abs=1e-6)
+    assert low.pitch == pytest.approx(0.1)
+    assert low.falls == 0.5
+
+
 def test_a_robot_in_another_skill_s_keyframe_is_not_distinct(recording):
     recording.height[:, 0] = 0.3
     recording.pitch[:, 0] = 0.1

@@ -6,14 +6,18 @@ import csv
 import io
 import json
 import shutil
+from dataclasses import replace
 
 import pytest
 from rich.console import Console
 
 from kiras_rl.config import load_config
+from kiras_rl.envs.quadruped import QuadrupedEnv
+from kiras_rl.robots.robot import load_robot
 from kiras_rl.tools import compare, evaluate, train
 from kiras_rl.tools.curves import read_scalars
 from kiras_rl.tools.evaluate import main
+from kiras_rl.tools.evaluator import evaluation_physics
 from kiras_rl.tools.policy_files import shipped_policy
 from kiras_rl.tools.protocols import PROTOCOLS
 from kiras_rl.tools.protocols.subject import Options, Subject
@@ -71,6 +75,13 @@ def test_terrain_is_crossed_level_by_level_and_gives_the_same_numbers_again(
 
 def test_transitions_are_measured_on_both_grounds(tmp_path, monkeypatch):
     monkeypatch.setattr(PROTOCOLS["transitions"], "HOLD", 1.5)  # s
+    tiles, place = [], QuadrupedEnv.place
+
+    def spy(self, kind, level, variant):
+        tiles.extend(zip(kind.tolist(), level.tolist(), variant.tolist(), strict=True))
+        place(self, kind, level, variant)
+
+    monkeypatch.setattr(QuadrupedEnv, "place", spy)
     assert main(["--protocol", "transitions", "--trials", "1", "--out", str(tmp_path)]) == 0
     found = results(tmp_path, "transitions")
     assert len(found) == 3
@@ -78,8 +89,66 @@ def test_transitions_are_measured_on_both_grounds(tmp_path, monkeypatch):
     assert flat["settled"][0][1] == 1.0 and flat["settled"][0][0] is None
     trace = next(value for key, value in found.items() if "/trace" in key)
     assert trace["order"] == [*SKILLS, "walk"]
+    # 20 trials: every variant of the four rough types, stairs up and stairs down
+    assert set(tiles) == {(kind, 3, variant) for kind in (1, 2, 3, 4) for variant in range(4)}
     assert trace["height"]["mean"][70] == pytest.approx(0.2, abs=0.02)  # of walking, at 1.4 s
     assert trace["height"]["mean"][145] == pytest.approx(0.1, abs=0.02)  # of crawling
+
+
+def test_a_policy_is_measured_by_its_own_keyframes(tmp_path, monkeypatch):
+    def changed(name):
+        robot = load_robot(name)
+        walk = replace(robot.keyframe("walk"), base_height=0.3)
+        return replace(robot, keyframes=(robot.keyframe("crawl"), walk))
+
+    command = ["--protocol", "flat", *FEW, "--nominal", "--out"]
+    assert main([*command, str(tmp_path / "before")]) == 0
+    monkeypatch.setattr("kiras_rl.tools.policy_files.load_robot", changed)
+    assert main([*command, str(tmp_path / "after")]) == 0
+    assert results(tmp_path / "after", "flat") == results(tmp_path / "before", "flat")
+
+
+def test_a_result_holds_for_the_physics_that_it_was_measured_on(tmp_path, monkeypatch):
+    def key(number, **options):
+        return Subject.load(None, None, tmp_path / str(number), Options(**options)).key("flat")
+
+    standard = key(1)
+    assert standard == key(2) == key(3, backend="native")
+    assert standard not in (key(4, backend="warp"), key(5, nominal=True))
+    slippery = load_config("solo8", ["env.randomization.friction=[0.1,0.2]"])
+    monkeypatch.setattr("kiras_rl.tools.evaluator.standard_config", lambda robot: slippery)
+    assert key(6) != standard
+
+
+def test_what_counts_as_a_fall_is_the_robot_s_standard():
+    standard = load_config("solo8")
+    trained = load_config("solo8", ["env.terminations.max_tilt=3.0"])
+    assert evaluation_physics(trained, False).env.terminations == standard.env.terminations
+
+
+def test_files_of_one_name_are_compared(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for name, policy in (("a", "flat"), ("b", "rough")):
+        (tmp_path / name).mkdir()
+        shutil.copy(shipped_policy("solo8").with_name(f"{policy}.onnx"), f"{name}/policy.onnx")
+    command = ["old=a/policy.onnx", "new=b/policy.onnx", "--protocol", "flat", *FEW]
+    assert compare.main(command) == 0
+    folders = sorted(path.name for path in (tmp_path / "evaluation").iterdir())
+    assert folders[0] == "policy" and folders[1].startswith("policy_") and len(folders) == 2
+
+
+def test_what_a_log_does_not_hold_is_left_out_unless_asked_for(tmp_path, smoke_run):
+    file = Subject.load(None, None, tmp_path / "a", Options())
+    run = Subject.load(smoke_run, None, tmp_path / "b", Options())
+    assert "learning" in evaluate.chosen(evaluate.ALL, [run])
+    assert not {"learning", "sampling"} & set(evaluate.chosen(evaluate.ALL, [run, file]))
+    assert evaluate.chosen(["sampling"], [file]) == ["sampling"]
+    young = tmp_path / "young"
+    shutil.copytree(smoke_run, young)
+    for log in young.glob("events.*"):
+        log.write_bytes(b"")
+    subject = Subject.load(young, None, tmp_path / "c", Options())
+    assert "learning" not in evaluate.chosen(None, [subject])
 
 
 def test_policies_are_set_side_by_side_and_seeds_pooled(tmp_path, capsys, monkeypatch):
@@ -189,5 +258,14 @@ def test_mistakes_are_one_line(tmp_path, capsys):
     assert "lies in no run folder" in capsys.readouterr().err
     assert main([str(tmp_path)]) == 2
     assert "error: " in capsys.readouterr().err
+    with pytest.raises(SystemExit):
+        main(["--duration", "1"])
+    assert "'1': give seconds, more than the first 1, which is not counted" in (
+        capsys.readouterr().err
+    )
+    (tmp_path / "file").touch()
+    assert main(["--protocol", "flat", *FEW, "--out", str(tmp_path / "file")]) == 2
+    message = capsys.readouterr().err
+    assert message.startswith("error: ") and message.count("\n") == 1 and "file" in message
     assert main(["--device", "gpu", "--protocol", "flat", *FEW]) == 2
     assert "device=gpu: allowed are auto, cpu, cuda" in capsys.readouterr().err

@@ -39,8 +39,8 @@ def test_skill_sampling_shows_mean_and_range_of_the_seeds():
     ]
     section = sampling.section({"ours": {"first_phase": 2, "curves": seeds}})
     (table,) = section.tables
-    # at 1/2 (before the first iteration), 3/2, 2 and the last iteration that both seeds have
-    assert table.rows[0] == ("ours", "walk", *(pytest.approx(x) for x in (30, 40, 50, 50)))
+    # at 1/2, before the first iteration, at 3/2, 2 and the last iteration that both seeds have
+    assert table.rows[0] == ("ours", "walk", None, *(pytest.approx(x) for x in (40, 50, 50)))
     (axis,) = section.figures[0].drawing.axes
     x, mean = axis.lines[0].get_data()
     assert (x[0], x[-1]) == (1, 3)
@@ -49,6 +49,8 @@ def test_skill_sampling_shows_mean_and_range_of_the_seeds():
     assert (band[:, 1].min(), band[:, 1].max()) == (pytest.approx(0.2), pytest.approx(0.6))
     phases = [(p.get_x(), p.get_x() + p.get_width()) for p in axis.patches]
     assert phases == [(0, 2), (2, 3)]
+    young = sampling.section({"ours": {"first_phase": 8, "curves": seeds}}).tables[0]
+    assert young.rows[0][2:] == (pytest.approx(50), None, None, pytest.approx(50))
 
 
 def test_learning_tells_when_every_seed_had_all_skills():
@@ -89,3 +91,9 @@ def test_seeds_are_averaged_counts_added_and_curves_kept():
         "curves": [{"walk": [[1, 0.2]]}, {"walk": [[1, 0.4]]}],
     }
     assert pool([first]) is first
+
+
+def test_what_one_seed_lacks_is_the_others():
+    curve = {"mean": [1.0], "low": [0.0]}
+    assert pool([{"height": curve}, {}]) == {"height": curve}
+    assert pool([{"height": curve}, {"height": None}]) == {"height": curve}

@@ -96,6 +96,25 @@ def test_an_interruption_keeps_what_there_is(tmp_path):
     assert Ledger(tmp_path, subject).content["results"] == {"first": 1}
 
 
+def test_two_evaluations_at_once_keep_each_other_s_results(tmp_path):
+    subject = {"sha256": "1", "label": "one"}
+    first, second = Ledger(tmp_path, subject), Ledger(tmp_path, subject)
+    first.get("mine", lambda: 1)
+    second.get("yours", lambda: 2)
+    first.get("later", lambda: 3)
+    results = {"mine": 1, "yours": 2, "later": 3}
+    assert Ledger(tmp_path, subject).content["results"] == results
+
+
+def test_another_policy_gets_a_folder_beside(tmp_path):
+    one = Ledger.beside(tmp_path / "policy", {"sha256": "1" * 64, "label": "one"})
+    other = Ledger.beside(tmp_path / "policy", {"sha256": "2" * 64, "label": "other"})
+    assert one.path.parent == tmp_path / "policy"
+    assert other.path.parent == tmp_path / "policy_22222222"
+    again = Ledger.beside(tmp_path / "policy", {"sha256": "1" * 64, "label": "one"})
+    assert again.path == one.path
+
+
 def test_results_of_another_policy_are_not_mixed_in(tmp_path):
     Ledger(tmp_path, {"sha256": "1", "label": "one"}).get("key", lambda: 1)
     with pytest.raises(ConfigError, match=r"results of another policy \(one\).*--out"):

@@ -6,7 +6,6 @@ import math
 from dataclasses import asdict
 
 from kiras_rl.evaluation.flat import FLOOR, SkillResult, evaluate_skills
-from kiras_rl.tools.evaluator import make_evaluation_env
 from kiras_rl.tools.protocols.rows import skill_table
 from kiras_rl.tools.protocols.subject import Subject
 from kiras_rl.tools.report.content import Cell, Column, Section, Table
@@ -41,7 +40,7 @@ def measure(subject: Subject) -> dict:
 
     def run() -> dict:
         worlds = options.robots * len(subject.skills)
-        env = make_evaluation_env(subject.flat(), worlds, options.duration, options.device)
+        env = subject.make_env(subject.flat(), worlds, options.duration)
         results = evaluate_skills(env, subject.policy_in(env), options.duration, options.command)
         return {name: asdict(result) for name, result in results.items()}
 

@@ -7,7 +7,6 @@ from collections.abc import Callable
 
 from kiras_rl.evaluation.flat import SETTLE
 from kiras_rl.evaluation.imitation import STEPS, evaluate_imitation
-from kiras_rl.tools.evaluator import make_evaluation_env
 from kiras_rl.tools.protocols.rows import scaled, skill_table
 from kiras_rl.tools.protocols.subject import Subject
 from kiras_rl.tools.report.content import Cell, Column, Section, Table
@@ -71,7 +70,7 @@ def piece(subject: Subject) -> tuple[str, Callable[[], dict]]:
         config.env.randomization.push_velocity = None
         duration = SETTLE + STEPS * config.sim.timestep * config.sim.substeps
         worlds = options.robots * len(subject.skills)
-        env = make_evaluation_env(config, worlds, duration, options.device)
+        env = subject.make_env(config, worlds, duration)
         return evaluate_imitation(env, subject.policy_in(env), options.command).as_dict()
 
     key = subject.key("imitation", robots=options.robots, command=options.command)

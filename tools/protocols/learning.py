@@ -28,6 +28,10 @@ PANELS = (
     ("height error [cm]", "height_error"),
     ("error of v_x [m/s]", "velocity_error"),
 )
+SPEED = "Perf/steps_per_second"
+TIMES = tuple(f"Perf/{part}_time" for part in ("physics", "environment", "inference", "learning"))
+"""Of an iteration, without its evaluation, s."""
+
 COLUMNS = (
     Column("policy"),
     Column("seeds", form="{}"),
@@ -51,20 +55,23 @@ def measure(subject: Subject) -> dict:
             f"learning: {subject.source} lies in no run folder; name the run that trained it"
         )
     log, config = read_scalars(run), subject.run
-    at = _evaluated(log, subject.skills, config.iterations)
+    at = _evaluated(log, subject)
     if not at:
         raise ConfigError(
-            f"learning: the log of {run} holds no evaluation of skill learning "
-            "(evaluation.interval=0 leaves them out)"
+            f"learning: the log of {run} holds no evaluation of skill learning: it is too young, "
+            "began with --flat, or evaluation.interval=0 left them out"
         )
-    steps = config.num_envs * config.learner.ppo.num_steps
+    seconds = sum(np.array(log[tag][1]) for tag in TIMES)
+    share = config.num_envs * config.learner.ppo.num_steps  # of one rank
+    steps = share * round(np.median(seconds * log[SPEED][1]) / share)
+    minutes = np.interp(at, log[SPEED][0], np.cumsum(seconds) / 60)
     results = [_results(log, subject.skills, iteration) for iteration in at]
     return {
         "skills": len(subject.skills),
         "curves": [
             {
                 "steps": [iteration * steps / 1e6 for iteration in at],
-                "minutes": _minutes(log, at, steps),
+                "minutes": minutes.tolist(),
                 "at_floor": [sum(r.meets(**FLOOR) for r in skills) for skills in results],
                 "height_error": [100 * _mean(skills, "height_error") for skills in results],
                 "velocity_error": [_mean(skills, "velocity_error") for skills in results],
@@ -74,13 +81,15 @@ def measure(subject: Subject) -> dict:
 
 
 def is_known(subject: Subject) -> bool:
-    """Return whether the policy lies in a run that evaluated itself."""
-    return run_of(subject.source) is not None and subject.run.evaluation.interval > 0
+    """Return whether the policy lies in a run that evaluated its skill learning."""
+    run = run_of(subject.source)
+    return run is not None and bool(_evaluated(read_scalars(run), subject))
 
 
-def _evaluated(log: Series, skills: tuple[str, ...], last: int) -> list[int]:
-    iterations, _ = log.get(f"Eval_{skills[0]}/height", ([], []))
-    return [iteration for iteration in iterations if iteration <= last]
+def _evaluated(log: Series, subject: Subject) -> list[int]:
+    """Return the iterations of skill learning after which the policy was evaluated."""
+    iterations, _ = log.get(f"Eval_{subject.skills[0]}/height", ([], []))
+    return [iteration for iteration in iterations if iteration <= subject.run.iterations]
 
 
 def _results(log: Series, skills: tuple[str, ...], iteration: int) -> list[SkillResult]:
@@ -92,13 +101,6 @@ def _results(log: Series, skills: tuple[str, ...], iteration: int) -> list[Skill
 
     names = [field.name for field in fields(SkillResult)]
     return [SkillResult(**{n: value(f"Eval_{skill}/{n}") for n in names}) for skill in skills]
-
-
-def _minutes(log: Series, at: list[int], steps: int) -> list[float]:
-    """Return the time of rollouts and updates until the given iterations, min."""
-    iterations, speeds = log["Perf/steps_per_second"]
-    spent = np.cumsum(steps / np.array(speeds)) / 60
-    return np.interp(at, iterations, spent).tolist()
 
 
 def _mean(results: list[SkillResult], name: str) -> float:

@@ -6,7 +6,6 @@ from functools import cache, partial
 
 from kiras_rl.envs.quadruped import QuadrupedEnv
 from kiras_rl.evaluation.terrain import TIME_LIMIT, Obstacle
-from kiras_rl.tools.evaluator import make_evaluation_env
 from kiras_rl.tools.protocols.crossing import count, share
 from kiras_rl.tools.protocols.rows import colours, panels
 from kiras_rl.tools.protocols.subject import Subject
@@ -77,7 +76,7 @@ def _build(subject: Subject, terrain: str, trials: int) -> QuadrupedEnv:
         risers = [STEPS[0] / 100, STEPS[-1] / 100]
         ground.types = {"stairs": {"proportion": 1.0, "riser": risers, "tread": 0.3}}
     worlds = trials * len(subject.skills)
-    return make_evaluation_env(config, worlds, TIME_LIMIT, subject.options.device)
+    return subject.make_env(config, worlds, TIME_LIMIT)
 
 
 def section(results: dict[str, dict]) -> Section:

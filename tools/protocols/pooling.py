@@ -16,8 +16,9 @@ def pool(results: list[Any]) -> Any:
     Args:
         results: Nested values of the same structure; None where nothing was measured.
     """
-    first = results[0]
-    if len(results) == 1:
+    results = [r for r in results if r is not None]
+    first = results[0] if results else None
+    if len(results) <= 1:
         return first
     if isinstance(first, dict):
         if COUNTS in first:

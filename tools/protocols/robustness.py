@@ -9,7 +9,6 @@ from functools import partial
 
 from kiras_rl.evaluation.flat import FLOOR, deal_skills, per_robot, record
 from kiras_rl.schema import Config, RandomizationConfig
-from kiras_rl.tools.evaluator import make_evaluation_env
 from kiras_rl.tools.protocols.rows import colours, panels
 from kiras_rl.tools.protocols.subject import Subject
 from kiras_rl.tools.report.content import Column, Figure, Section, Table
@@ -17,7 +16,8 @@ from kiras_rl.tools.report.content import Column, Figure, Section, Table
 TITLE = "Robustness"
 TEXT = (
     "Every skill walks straight ahead for 10 s on flat ground while one disturbance is set to a "
-    "value and all others are drawn as in training. A robot succeeds if it does not fall and its "
+    "value and all others are drawn as in training. Pushes come about every 5 s, each axis up to "
+    "the value. A robot succeeds if it does not fall and its "
     f"errors stay at the floor's: {100 * FLOOR['height']:.0f} cm, "
     f"{math.degrees(FLOOR['pitch']):.0f} degrees, {FLOOR['velocity']:.2f} m/s."
 )
@@ -101,7 +101,7 @@ def measure(subject: Subject) -> dict:
         config = subject.flat()
         sweep.apply(config.env.randomization, value)
         worlds = options.robots * len(subject.skills)
-        env = make_evaluation_env(config, worlds, DURATION, options.device)
+        env = subject.make_env(config, worlds, DURATION)
         tasks = deal_skills(env, options.command)
         recording = record(env, subject.policy_in(env), DURATION, *tasks)
         robots = per_robot(recording, env)

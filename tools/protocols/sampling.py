@@ -91,10 +91,12 @@ def _seeds(values: dict, skill: str, iterations: np.ndarray) -> np.ndarray:
     return np.stack([np.interp(iterations, x, y) for x, y in curves])
 
 
-def _shares(values: dict, skill: str) -> list[float]:
-    """Return the mean probabilities at the times of the table, %."""
-    at = [share * values["first_phase"] for share in (0.25, 0.75, 1.0)]
-    return (100 * _seeds(values, skill, np.array([*at, _ends(values)[1]])).mean(axis=0)).tolist()
+def _shares(values: dict, skill: str) -> list[float | None]:
+    """Return the mean probabilities at the times of the table, %; None where it has not been."""
+    begin, end = _ends(values)
+    at = [share * values["first_phase"] for share in (0.25, 0.75, 1.0)] + [end]
+    means = 100 * _seeds(values, skill, np.array(at)).mean(axis=0)
+    return [m if begin <= t <= end else None for m, t in zip(means.tolist(), at, strict=True)]
 
 
 def _figure(results: dict[str, dict], skills: list[str]) -> Figure:

@@ -5,8 +5,9 @@ from __future__ import annotations
 import copy
 import hashlib
 import itertools
+import json
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -14,14 +15,21 @@ from typing import Any
 import torch
 from tensordict import TensorDict
 
-from kiras_rl.config import list_configs, load_config
-from kiras_rl.deploy.policy import OnboardPolicy
+from kiras_rl.deploy.policy import OnboardPolicy, PolicyMetadata
+from kiras_rl.envs import resolve_backend
 from kiras_rl.envs.quadruped import QuadrupedEnv
 from kiras_rl.evaluation.flat import Policy
 from kiras_rl.phases import FINETUNING, SKILL_LEARNING, phase_config
+from kiras_rl.robots.robot import Robot
 from kiras_rl.schema import Config
-from kiras_rl.tools.evaluator import evaluation_physics, onboard_policy, trained_config
-from kiras_rl.tools.policy_files import find_policy, load_policy, shipped_policy
+from kiras_rl.tools.evaluator import (
+    evaluation_physics,
+    make_evaluation_env,
+    onboard_policy,
+    standard_config,
+    trained_config,
+)
+from kiras_rl.tools.policy_files import find_policy, load_policy, robot_of, shipped_policy
 from kiras_rl.tools.report.ledger import Ledger
 
 
@@ -81,7 +89,7 @@ class Subject:
         label: How tables and figures call it.
         source: The file that it came from.
         onboard: The policy as the robot runs it.
-        folder: Where its results are kept.
+        ledger: Its results so far.
         options: What the user changed.
         progress: Of the protocol at hand.
     """
@@ -89,7 +97,7 @@ class Subject:
     label: str
     source: Path
     onboard: OnboardPolicy
-    folder: Path
+    ledger: Ledger
     options: Options = field(default_factory=Options)
     progress: Progress = field(default_factory=Progress)
 
@@ -100,19 +108,24 @@ class Subject:
         """Load what a user points at; see `policy_files.load_policy`.
 
         Without `folder` the results of a run lie in its folder evaluation/, others in
-        evaluation/<label>/.
+        evaluation/<label>/, or beside that where it holds those of another policy.
 
         Raises:
+            ConfigError: If `folder` holds the results of another policy.
             PolicyError: If there is no policy, or one of another robot.
         """
         onboard = load_policy(source, robot)
         file = shipped_policy(robot or onboard.metadata.robot) if source is None else source
         file = find_policy(file)
         label = _label(file if source is None else source)
+        about = _describe(label, file, onboard.metadata)
         if folder is None:
             is_run = source is not None and source.is_dir()
-            folder = source / "evaluation" if is_run else Path("evaluation") / label
-        return cls(label, file, onboard, folder, options)
+            place = source / "evaluation" if is_run else Path("evaluation") / label
+            ledger = Ledger.beside(place, about)
+        else:
+            ledger = Ledger(folder, about)
+        return cls(label, file, onboard, ledger, options)
 
     @property
     def skills(self) -> tuple[str, ...]:
@@ -144,15 +157,20 @@ class Subject:
             self.progress.done += missing
         return results
 
-    @cached_property
-    def ledger(self) -> Ledger:
-        """The results so far."""
-        return Ledger(self.folder, self.describe())
+    @property
+    def folder(self) -> Path:
+        """Where the results are kept."""
+        return self.ledger.path.parent
 
     @cached_property
     def run(self) -> Config:
         """The configuration of the training."""
         return trained_config(self.onboard.metadata)
+
+    @cached_property
+    def robot(self) -> Robot:
+        """The robot as it was in training."""
+        return robot_of(self.onboard.metadata)
 
     @property
     def is_finetuned(self) -> bool:
@@ -164,17 +182,17 @@ class Subject:
         return self._physics(phase_config(self.run, SKILL_LEARNING))
 
     def rough(self) -> Config:
-        """Return the configuration of terrain, its robot's own for one that was trained without."""
-        if self.run.finetuning:
-            return self._physics(phase_config(self.run, FINETUNING))
-        robot = self.run.robot
-        standard = phase_config(
-            load_config(robot if robot in list_configs() else "base"), FINETUNING
-        )
+        """Return the configuration of the robot's standard terrain."""
+        standard = phase_config(standard_config(self.run.robot), FINETUNING)
         config = self.flat()
-        config.sim, config.env.terrain = standard.sim, standard.env.terrain
-        config.sim.backend = self.options.backend
+        config.env.terrain = standard.env.terrain
+        for capacity in ("max_contacts", "max_constraints", "max_ccd"):
+            setattr(config.sim, capacity, getattr(standard.sim, capacity))
         return config
+
+    def make_env(self, config: Config, num_envs: int, duration: float) -> QuadrupedEnv:
+        """Build an environment for trials of the policy's own robot; see `make_evaluation_env`."""
+        return make_evaluation_env(config, num_envs, duration, self.options.device, self.robot)
 
     def _physics(self, config: Config) -> Config:
         config = evaluation_physics(copy.deepcopy(config), self.options.nominal)
@@ -183,19 +201,36 @@ class Subject:
 
     def key(self, protocol: str, **parts: object) -> str:
         """Return the name of a result: all that it depends on beside the policy."""
-        common = {"nominal": self.options.nominal, "backend": self.options.backend}
+        device = torch.device(self.options.device)
+        common = {
+            "nominal": self.options.nominal,
+            "backend": resolve_backend(self.options.backend, device),
+            "device": device.type,
+            "physics": self._physics_digest,
+        }
         return " ".join([protocol, *(f"{name}={part}" for name, part in (parts | common).items())])
 
-    def describe(self) -> dict:
-        """Return what tells this policy from others, for the files."""
-        return {
-            "label": self.label,
-            "source": str(self.source),
-            "sha256": hashlib.sha256(self.source.read_bytes()).hexdigest(),
-            "robot": self.onboard.metadata.robot,
-            "skills": list(self.skills),
-            "provenance": self.onboard.metadata.provenance,
-        }
+    @cached_property
+    def _physics_digest(self) -> str:
+        """A short name of robot, simulation and environment: other ones give other results."""
+        contract = self.onboard.metadata.to_dict() | {"provenance": None, "version": None}
+        mjcf = (self.robot.folder / f"{self.robot.name}.xml").read_text(encoding="utf-8")
+        machine = {"backend": None, "threads": None}  # the first one is in the key by itself
+        grounds = [(asdict(c.sim) | machine, asdict(c.env)) for c in (self.flat(), self.rough())]
+        text = json.dumps([contract, mjcf, *grounds], sort_keys=True)
+        return hashlib.sha256(text.encode()).hexdigest()[:8]
+
+
+def _describe(label: str, source: Path, metadata: PolicyMetadata) -> dict:
+    """Return what tells a policy from others, for the files."""
+    return {
+        "label": label,
+        "source": str(source),
+        "sha256": hashlib.sha256(source.read_bytes()).hexdigest(),
+        "robot": metadata.robot,
+        "skills": list(metadata.skills),
+        "provenance": metadata.provenance,
+    }
 
 
 def _label(source: Path) -> str:

@@ -6,7 +6,6 @@ from functools import cache, partial
 
 from kiras_rl.envs.quadruped import QuadrupedEnv
 from kiras_rl.evaluation.terrain import TIME_LIMIT, Obstacle, TerrainResult, rough_types
-from kiras_rl.tools.evaluator import make_evaluation_env
 from kiras_rl.tools.protocols.crossing import count, pooled, share
 from kiras_rl.tools.protocols.rows import colours, panels
 from kiras_rl.tools.protocols.subject import Subject
@@ -48,7 +47,7 @@ def terrain_env(subject: Subject, trials: int) -> QuadrupedEnv:
     config = subject.rough()
     config.env.terrain.levels = LEVELS
     worlds = trials * len(subject.skills)
-    return make_evaluation_env(config, worlds, TIME_LIMIT, subject.options.device)
+    return subject.make_env(config, worlds, TIME_LIMIT)
 
 
 def rough_names(subject: Subject) -> list[str]:

@@ -7,9 +7,9 @@ from dataclasses import asdict
 
 import torch
 
+from kiras_rl.envs.quadruped import QuadrupedEnv
 from kiras_rl.evaluation.transitions import AFTER, BEFORE, evaluate_transitions, trace_skills
 from kiras_rl.schema import Config
-from kiras_rl.tools.evaluator import make_evaluation_env
 from kiras_rl.tools.protocols.rows import colours, panels, scaled
 from kiras_rl.tools.protocols.subject import Subject
 from kiras_rl.tools.report.content import Cell, Column, Figure, Section, Table
@@ -19,11 +19,12 @@ TEXT = (
     "Every ordered pair of skills, switched while walking after 2 s: falls, and the time until the "
     "moving averages of height (1.5 cm) and pitch (3 degrees) stay at the new keyframe for 0.3 s; "
     "a robot that was not in the first skill before the switch counts as not settled. Rough: on "
-    "all rough terrain types in turn, level 3 of 0 to 9."
+    "all rough terrain types in turn, up and down, level 3 of 0 to 9."
 )
 
 TRIALS = 50  # of a pair
-ROUGH_LEVEL = 3
+ROUGH_LEVELS, ROUGH_LEVEL = 10, 3
+VARIANTS = 4  # of a tile; every second one leads the other way
 HOLD = 3.0  # s of each skill in the traces
 TRACE_ROBOTS = 20
 
@@ -58,12 +59,9 @@ def measure(subject: Subject) -> dict:
 
     def pairs(config: Config, rough: bool) -> dict:
         worlds = len(subject.skills) * (len(subject.skills) - 1) * trials
-        env = make_evaluation_env(config, worlds, BEFORE + AFTER, options.device)
+        env = subject.make_env(config, worlds, BEFORE + AFTER)
         if rough:
-            kinds = [i for i, name in enumerate(env.terrains) if name != "flat"]
-            kind = torch.tensor(kinds, device=env.device).repeat(env.num_envs // len(kinds) + 1)
-            kind = kind[: env.num_envs]
-            env.place(kind, torch.full_like(kind, ROUGH_LEVEL))
+            env.place(*_rough_tiles(env))
         result = asdict(evaluate_transitions(env, subject.policy_in(env), trials, options.command))
         return {
             name: [[_plain(x) for x in row] for row in value.tolist()]
@@ -73,7 +71,7 @@ def measure(subject: Subject) -> dict:
 
     def trace() -> dict:
         order = [*range(len(subject.skills)), 0]
-        env = make_evaluation_env(subject.flat(), TRACE_ROBOTS, HOLD * len(order), options.device)
+        env = subject.make_env(subject.flat(), TRACE_ROBOTS, HOLD * len(order))
         height, pitch = trace_skills(env, subject.policy_in(env), order, HOLD, options.command)
         curves = {
             name: {
@@ -94,11 +92,26 @@ def measure(subject: Subject) -> dict:
 
     pieces = {
         subject.key("transitions/flat", **keep): lambda: pairs(subject.flat(), rough=False),
-        subject.key("transitions/rough", **keep): lambda: pairs(subject.rough(), rough=True),
+        subject.key("transitions/rough", **keep): lambda: pairs(_rough(subject), rough=True),
         subject.key("transitions/trace", command=options.command): trace,
     }
     results = zip(("flat", "rough", "trace"), subject.results(pieces).values(), strict=True)
     return {"skills": list(subject.skills), **dict(results)}
+
+
+def _rough(subject: Subject) -> Config:
+    config = subject.rough()
+    config.env.terrain.levels, config.env.terrain.variants = ROUGH_LEVELS, VARIANTS
+    return config
+
+
+def _rough_tiles(env: QuadrupedEnv) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Return types, levels and variants, (N,) each: every variant of every rough type in turn."""
+    kinds = torch.tensor([i for i, name in enumerate(env.terrains) if name != "flat"])
+    world = torch.arange(env.num_envs)
+    kind, variant = kinds[world % len(kinds)], world // len(kinds) % VARIANTS
+    level = torch.full_like(world, ROUGH_LEVEL)
+    return kind.to(env.device), level.to(env.device), variant.to(env.device)
 
 
 def section(results: dict[str, dict]) -> Section:

@@ -7,15 +7,22 @@ import os
 from collections.abc import Callable
 from pathlib import Path
 
+from filelock import FileLock
+
 from kiras_rl.config import ConfigError
 
 FILE = "results.json"
 
 
+class ForeignResultsError(ConfigError):
+    """A folder that holds the results of another policy."""
+
+
 class Ledger:
     """A JSON file of results by key, written whole after each new one.
 
-    The same command given again finds what is done and measures only what is missing.
+    The same command given again finds what is done and measures only what is missing. Several
+    processes may add to one file.
     """
 
     def __init__(self, folder: Path, subject: dict) -> None:
@@ -30,25 +37,36 @@ class Ledger:
         """
         self.path = folder / FILE
         self.content: dict = {"subject": subject, "results": {}}
-        if self.path.is_file():
-            self.content = self._read(subject)
         folder.mkdir(parents=True, exist_ok=True)
+        self._keep({})
 
-    def _read(self, subject: dict) -> dict:
+    @classmethod
+    def beside(cls, folder: Path, subject: dict) -> Ledger:
+        """Open the results in `folder`, or beside it where that holds those of another policy."""
+        try:
+            return cls(folder, subject)
+        except ForeignResultsError:
+            return cls(folder.with_name(f"{folder.name}_{subject['sha256'][:8]}"), subject)
+
+    def _read(self) -> dict:
+        """Return the results on file, those of other processes among them."""
+        if not self.path.is_file():
+            return {}
+        subject = self.content["subject"]
         try:
             content = json.loads(self.path.read_text(encoding="utf-8"))
             mine = content["subject"]["sha256"] == subject["sha256"]
-            _ = content["results"].items()
+            results = dict(content["results"].items())
         except (ValueError, KeyError, TypeError, AttributeError):
             raise ConfigError(
                 f"{self.path} holds no results of kiras-evaluate: name another folder with --out"
             ) from None
         if not mine:
-            raise ConfigError(
+            raise ForeignResultsError(
                 f"{self.path} holds results of another policy ({content['subject']['label']}): "
                 "name another folder with --out, or delete that one"
             )
-        return content
+        return results
 
     def __contains__(self, key: str) -> bool:
         """Return whether there is a result of a key."""
@@ -61,14 +79,15 @@ class Ledger:
             key: Names the protocol and everything that the result depends on.
             measure: Gives plain values, ready for JSON.
         """
-        results = self.content["results"]
-        if key not in results:
+        if key not in self:
             # Through JSON, so that a result is the same whether it was measured or read.
-            results[key] = json.loads(json.dumps(measure()))
-            self._write()
-        return results[key]
+            self._keep({key: json.loads(json.dumps(measure()))})
+        return self.content["results"][key]
 
-    def _write(self) -> None:
-        temporary = self.path.with_name(f".{FILE}.{os.getpid()}")
-        temporary.write_text(json.dumps(self.content, indent=1) + "\n", encoding="utf-8")
-        temporary.replace(self.path)
+    def _keep(self, new: dict) -> None:
+        """Add results to those on file, whole or not at all."""
+        with FileLock(self.path.with_name(f".{FILE}.lock")):
+            self.content["results"] = self._read() | new
+            temporary = self.path.with_name(f".{FILE}.{os.getpid()}")
+            temporary.write_text(json.dumps(self.content, indent=1) + "\n", encoding="utf-8")
+            temporary.replace(self.path)
