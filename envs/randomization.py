@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from torch.quasirandom import SobolEngine
 
+from kiras_rl.config import ConfigError
 from kiras_rl.envs.model import Scene
 from kiras_rl.envs.randomness import UniformBuffer, scale_to
 from kiras_rl.envs.simulation.base import BODY_FIELDS, Simulation
@@ -128,11 +129,20 @@ def draw_bodies(
 
     Returns:
         Name -> values, (count, *shape of the field in MjModel).
+
+    Raises:
+        ConfigError: A payload that takes away all of the base.
     """
+    nominal = scene.model.body_mass[scene.base_body]
+    if payload and nominal + payload[0] <= 0:
+        raise ConfigError(
+            f"env.randomization.payload={list(payload)}: the base weighs {nominal:.2f} kg, so that "
+            f"more than {-nominal:.2f} is allowed"
+        )
     model, base = copy.copy(scene.model), scene.base_body
     data = mujoco.MjData(model)
     uniform = SobolEngine(4, scramble=True, seed=1).draw(count, dtype=torch.float64)
-    masses = scale_to(uniform[:, 0], *(payload or (0.0, 0.0))) + model.body_mass[base]
+    masses = scale_to(uniform[:, 0], *(payload or (0.0, 0.0))) + nominal
     shift = scale_to(uniform[:, 1:], *(com_shift or (0.0, 0.0))).numpy()
     centres = model.body_ipos[base] + shift
     fields = {

@@ -58,7 +58,7 @@ _LARGEST_SEED = 2**63 - 1  # torch takes one bit more, which leaves room for the
 LIMITS = {
     "seed": (0, _LARGEST_SEED),
     "env.terrain.seed": (0, _LARGEST_SEED),
-    "learner.skill_init.floor": (0, 0.5),  # 1 / S of S skills; one skill has no use for it
+    "learner.skill_init.floor": (0, 1),  # what S skills can have is checked with them
 }
 """The least and the largest value."""
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import torch
 
+from kiras_rl.config import ConfigError
 from kiras_rl.schema import SkillInitConfig
 
 
@@ -47,7 +48,16 @@ class SkillSampler:
     """The probabilities with which the environment draws skills, renewed once an iteration."""
 
     def __init__(self, config: SkillInitConfig, num_skills: int, device: str) -> None:
-        """Begin uniform."""
+        """Begin uniform.
+
+        Raises:
+            ConfigError: A floor that all skills together cannot have.
+        """
+        if num_skills > 1 and config.floor * num_skills > 1:
+            raise ConfigError(
+                f"learner.skill_init.floor={config.floor}: with {num_skills} skills at most "
+                f"{1 / num_skills:.3f}"
+            )
         self._config = config
         self.probabilities = torch.full((num_skills,), 1.0 / num_skills, device=device)
 

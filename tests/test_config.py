@@ -163,8 +163,8 @@ def test_policy_and_critic_have_a_hidden_layer(key):
     [
         ("seed=-1", f"0 to {2**63 - 1}"),
         (f"seed={2**63}", f"0 to {2**63 - 1}"),
-        ("learner.skill_init.floor=-0.1", "0 to 0.5"),
-        ("learner.skill_init.floor=0.9", "0 to 0.5"),
+        ("learner.skill_init.floor=-0.1", "0 to 1"),
+        ("learner.skill_init.floor=1.5", "0 to 1"),
     ],
 )
 def test_what_has_limits_is_refused_outside_of_them(override, allowed):

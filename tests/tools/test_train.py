@@ -169,6 +169,8 @@ def refusal(capsys, *argv):
         (["--cfg", "smoke", "finetuning.sim.backend=x"], "allowed are auto, native, warp"),
         (["--cfg", "smoke", "finetuning.learner.ppo.actor_dims=[8]"], "other sizes of the actor"),
         (["--cfg", "smoke", "finetuning.learner.estimator=null"], "than in skill learning"),
+        (["--cfg", "smoke", "env.randomization.payload=[-9,0]"], "the base weighs"),
+        (["--cfg", "smoke", "learner.skill_init.floor=0.3"], "with 5 skills at most 0.2"),
         (["--cfg", "smoke", "device=cpu:x"], "allowed are auto, cpu, cuda, cuda:N"),
         (["--resume", "runs/nothing"], "does not exist: give a run folder or a checkpoint file"),
     ],
