@@ -54,11 +54,12 @@ clean:  ## remove the environment and build outputs, never runs/
 .venv/bin/pip:
 	@for python in $(PYTHON); do \
 	    $$python -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null || continue; \
-	    $$python -c 'import ensurepip, venv' 2>/dev/null || { \
-	        echo "error: $$python has no venv module: install the package python3-venv" >&2; \
-	        exit 1; }; \
+	    $$python -c 'import ensurepip, venv' 2>/dev/null || { bare=$${bare:-$$python}; continue; }; \
 	    exec $$python -m venv --clear .venv; \
 	done; \
+	if [ "$$bare" ]; then \
+	    echo "error: $$bare has no venv module: install the package $$(basename $$bare)-venv" >&2; exit 1; \
+	fi; \
 	echo "error: none of '$(PYTHON)' is Python 3.11 or newer: install one," \
 	    "or name it, as in make train PYTHON=/path/to/python3" >&2; \
 	exit 1

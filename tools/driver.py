@@ -85,7 +85,6 @@ class Driver:
         self.robot = robot_of(meta)
         self._terrain = terrain
         self._build(FLAT)
-        self.substeps = round(1 / (meta.control_rate * self.model.opt.timestep))
         self._gravity = np.array([_gravity_at(meta.keyframes[s].pitch) for s in meta.skills])
         self._steps = 0
         self._skill, self._command = 0, np.zeros(3)
@@ -97,6 +96,9 @@ class Driver:
             self.terrain.build(spec, tile)
         self.tile, self.spec = tile, spec
         self.model = spec.compile()
+        rate, option = self.metadata.control_rate, self.model.opt
+        self.substeps = round(1 / (rate * option.timestep))
+        option.timestep = 1 / (rate * self.substeps)  # another one where the policy's rate asks it
         self.data = mujoco.MjData(self.model)
         self._feet = np.array([self.model.geom(name).id for name in self.robot.foot_geoms])
         self._base = np.array([self.model.geom(name).id for name in self.robot.base_geoms])

@@ -18,6 +18,7 @@ from rich.table import Table
 
 from kiras_rl.robots.robot import Keyframe, Robot, RobotError, load_robot
 from kiras_rl.robots.statics import KeyframeReport, examine_keyframe
+from kiras_rl.tools.outputs import PICTURES, file_of
 from kiras_rl.tools.rendering import RenderError, make_renderer
 
 TILE = (420, 340)
@@ -33,7 +34,9 @@ def main(argv: list[str] | None = None) -> int:
     """Run the command; returns 0, or 2 after an error."""
     parser = argparse.ArgumentParser(prog="kiras-keyframes", description=__doc__.splitlines()[0])
     parser.add_argument("robot", help="a folder of robots/, e.g. solo8")
-    parser.add_argument("--out", type=Path, help="picture (default: runs/keyframes/ROBOT.png)")
+    parser.add_argument(
+        "--out", type=file_of(PICTURES), help="picture (default: runs/keyframes/ROBOT.png)"
+    )
     arguments = parser.parse_args(argv)
     try:
         robot = load_robot(arguments.robot)
@@ -44,7 +47,10 @@ def main(argv: list[str] | None = None) -> int:
     problems = [problem for report in reports if (problem := report.problem())]
     for problem in problems:
         _fail(problem)
-    drawn = _save_picture(reports, arguments.out)
+    try:
+        drawn = _save_picture(reports, arguments.out)
+    except OSError as error:
+        return _fail(str(error))
     return 2 if problems or not drawn else 0
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 from rich.console import Console
@@ -15,6 +15,7 @@ from kiras_rl.robots.robot import RobotError
 from kiras_rl.tools import policy_files, summary
 from kiras_rl.tools.driver import Driver
 from kiras_rl.tools.ground import FLAT, terrain_of
+from kiras_rl.tools.outputs import PICTURES, file_of
 from kiras_rl.tools.rendering import RenderError
 from kiras_rl.tools.script import (
     Segment,
@@ -68,10 +69,9 @@ examples:
 _COMMAND = "0.3"  # m/s, of a script that is not given
 _SCREENSHOT_SPEED = 0.3  # m/s
 
-_PICTURES = (".png", ".jpg", ".pdf", ".svg")
 _OUTPUTS = {
-    "--trace": ((*_PICTURES, ".npz"), "everything over time, drawn or as arrays"),
-    "--frames": (_PICTURES, "a strip of pictures for every skill"),
+    "--trace": ((*PICTURES, ".npz"), "everything over time, drawn or as arrays"),
+    "--frames": (PICTURES, "a strip of pictures for every skill"),
     "--video": ((".mp4",), "a film; needs kiras-rl[video]"),
     "--screenshot": ((".png", ".jpg"), "the page, drawn by a headless Chromium"),
 }
@@ -115,7 +115,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--terrain", metavar="TYPE[:LEVEL[:VARIANT]]", help="ground to drive on, as above (flat)")
     add("--table", action="store_true", help="print every skill's errors")
     for name, (endings, text) in _OUTPUTS.items():
-        add(name, type=_file(endings), metavar="FILE", help=f"{text} ({' '.join(endings)})")
+        add(name, type=file_of(endings), metavar="FILE", help=f"{text} ({' '.join(endings)})")
     _add_live_options(parser.add_argument_group("live"))
     return parser
 
@@ -127,15 +127,6 @@ def _add_live_options(group: argparse._ArgumentGroup) -> None:
     add("--host", default=LOOPBACK, help=f"address that the page listens on ({LOOPBACK})")
     add("--port", type=int, default=DEFAULT_PORT, help=f"its port, 0: any ({DEFAULT_PORT})")
     add("--no-browser", action="store_true", help="only print the page's address")
-
-
-def _file(endings: tuple[str, ...]) -> Callable[[str], Path]:
-    def check(text: str) -> Path:
-        if Path(text).suffix not in endings:
-            raise argparse.ArgumentTypeError(f"'{text}' does not end in {' '.join(endings)}")
-        return Path(text)
-
-    return check
 
 
 def _is_live(options: argparse.Namespace) -> bool:

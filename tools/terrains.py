@@ -22,6 +22,7 @@ from kiras_rl.envs.terrain_library import TerrainLibrary, build_library
 from kiras_rl.phases import FINETUNING, phase_config
 from kiras_rl.robots.robot import Robot, RobotError, load_robot
 from kiras_rl.schema import Config
+from kiras_rl.tools.outputs import PICTURES, file_of
 from kiras_rl.tools.rendering import RenderError, make_renderer
 from kiras_rl.tools.terrain_budgets import measure_budgets
 
@@ -41,7 +42,9 @@ def main(argv: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="kiras-terrains", description=__doc__.splitlines()[0])
     parser.add_argument("robot", help="a folder of robots/, e.g. solo8")
     parser.add_argument("--cfg", default="base", help="configuration with the terrain")
-    parser.add_argument("--out", type=Path, help="picture (default: runs/terrains/ROBOT.png)")
+    parser.add_argument(
+        "--out", type=file_of(PICTURES), help="picture (default: runs/terrains/ROBOT.png)"
+    )
     parser.add_argument("--budgets", action="store_true", help="measure contacts on MuJoCo-Warp")
     parser.add_argument("overrides", nargs="*", metavar="key=value", help="of the configuration")
     arguments = parser.parse_intermixed_args(argv)  # options between overrides, too
@@ -60,8 +63,11 @@ def main(argv: list[str] | None = None) -> int:
         figure = draw(robot, library)
     except RenderError as error:
         return _fail(str(error))
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        figure.savefig(path)
+    except OSError as error:
+        return _fail(str(error))
     print(f"picture: {path}")
     return 0
 

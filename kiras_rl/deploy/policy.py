@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import difflib
+import operator
 import os
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -18,6 +20,9 @@ if TYPE_CHECKING:
     import onnxruntime
 
 __all__ = ["OnboardPolicy", "PolicyError", "PolicyMetadata"]
+
+LARGEST_READING = 1000.0
+"""rad, rad/s, m/s: beyond what joints, gyroscopes and commands can be; a driver's fault."""
 
 
 @dataclass(frozen=True)
@@ -76,7 +81,7 @@ class OnboardPolicy:
         """Forget the past; the next frame starts a new history.
 
         Args:
-            joint_pos: Joint targets that the robot holds now, (J,), rad.
+            joint_pos: Joint targets that the robot holds now, or where it stands, (J,), rad.
         """
         joint_pos = self._vector("joint_pos", joint_pos, self.metadata.num_joints)
         self.action = (joint_pos - self._default) / self._scale  # the action that holds this pose
@@ -106,7 +111,8 @@ class OnboardPolicy:
             Joint targets, (J,), rad.
 
         Raises:
-            PolicyError: If a reading has another length or is not finite, or the skill is unknown.
+            PolicyError: If a reading has another length, is not finite or beyond LARGEST_READING,
+                or the skill is unknown. The policy is then as it was before.
         """
         joints = self.metadata.num_joints
         reading = Reading(
@@ -130,8 +136,9 @@ class OnboardPolicy:
         skills = self.metadata.skills
         if isinstance(skill, str) and skill in skills:
             return skills.index(skill)
-        if not isinstance(skill, str) and 0 <= skill < len(skills):
-            return int(skill)
+        with suppress(TypeError):  # what is no whole number
+            if 0 <= operator.index(skill) < len(skills):
+                return operator.index(skill)
         close = difflib.get_close_matches(str(skill), skills, n=1)
         hint = f" (did you mean '{close[0]}'?)" if close else ""
         raise PolicyError(f"unknown skill '{skill}'{hint}; this policy has: {', '.join(skills)}")
@@ -176,19 +183,26 @@ class OnboardPolicy:
         return self._default + self._scale * self.action
 
     def _vector(self, name: str, values: ArrayLike, size: int) -> np.ndarray:
-        vector = np.asarray(values, np.float64)
+        try:
+            vector = np.asarray(values, np.float64)
+        except (TypeError, ValueError):
+            raise PolicyError(f"{name} is no list of numbers: {values!r}") from None
         if vector.shape != (size,):
             raise PolicyError(
                 f"{name} has shape {vector.shape}, expected ({size},) for {self.metadata.robot}"
             )
         if not np.isfinite(vector).all():
             raise PolicyError(f"{name} is not finite: {vector}")
+        if np.abs(vector).max() > LARGEST_READING:
+            raise PolicyError(
+                f"{name} is beyond {LARGEST_READING:g}, which no sensor means: {vector}"
+            )
         return vector
 
 
 def _unit(quat: np.ndarray) -> np.ndarray:
     norm = np.linalg.norm(quat)
-    if norm < 0.5:  # a sensor that is not ready sends zeros; rounding is far from this
+    if not 0.5 <= norm <= 2.0:  # a sensor that is not ready sends zeros; rounding is far from this
         raise PolicyError(f"imu_quat is not a rotation: {quat}")
     return quat / norm
 

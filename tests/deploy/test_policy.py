@@ -131,12 +131,22 @@ def test_a_skill_by_name_and_by_index_is_the_same(exported):
         ({"joint_pos": np.zeros(12)}, r"joint_pos has shape \(12,\), expected \(8,\) for solo8"),
         ({"command": (0.3, 0)}, r"command has shape \(2,\), expected \(3,\)"),
         ({"joint_vel": np.full(8, np.nan)}, "joint_vel is not finite"),
+        ({"joint_vel": np.full(8, 1e39)}, "joint_vel is beyond 1000"),
+        ({"joint_pos": [0.0, [1.0]] * 4}, "joint_pos is no list of numbers"),
         ({"imu_quat": (0, 0, 0, 0)}, "imu_quat is not a rotation"),
+        ({"imu_quat": (9, 9, 9, 9)}, "imu_quat is not a rotation"),
+        ({"skill": None}, "unknown skill 'None'"),
+        ({"skill": 1.7}, "unknown skill '1.7'"),
+        ({"skill": np.array([1, 2])}, "unknown skill"),
     ],
 )
-def test_a_wrong_reading_is_named(policy, changes, message):
+def test_a_wrong_reading_is_named_and_leaves_no_trace(policy, changes, message):
+    step(policy)
+    before = [x.copy() for x in (policy.frame, policy.history, policy.action)]
     with pytest.raises(PolicyError, match=message):
         step(policy, **changes)
+    for mine, its in zip((policy.frame, policy.history, policy.action), before, strict=True):
+        np.testing.assert_array_equal(mine, its)
 
 
 def test_a_missing_file_is_named(tmp_path):

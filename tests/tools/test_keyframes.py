@@ -4,7 +4,7 @@ import pytest
 
 from kiras_rl.robots.robot import load_robot
 from kiras_rl.robots.statics import examine_keyframe
-from kiras_rl.tools import keyframes, rendering
+from kiras_rl.tools import keyframes, rendering, terrains
 
 
 @pytest.fixture(autouse=True)
@@ -30,6 +30,17 @@ def opengl():
         rendering.choose_backend()
     except rendering.RenderError as error:
         pytest.skip(str(error))
+
+
+@pytest.mark.parametrize("command", [keyframes.main, terrains.main])
+def test_a_picture_that_cannot_be_written_is_refused(command, opengl, tmp_path, capsys):
+    with pytest.raises(SystemExit) as caught:
+        command(["solo8", "--out", "a.txt"])
+    assert caught.value.code == 2
+    assert "'a.txt' does not end in .png" in capsys.readouterr().err
+    (tmp_path / "file").touch()
+    assert command(["solo8", "--out", "file/a.png"]) == 2
+    assert capsys.readouterr().err.startswith("error: ")
 
 
 def test_table_says_what_each_keyframe_asks(no_opengl, capsys):

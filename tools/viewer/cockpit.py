@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from kiras_rl.config import ConfigError
-from kiras_rl.deploy.policy import OnboardPolicy
+from kiras_rl.deploy.policy import OnboardPolicy, PolicyError
 from kiras_rl.tools.driver import Driver, Sample
 from kiras_rl.tools.ground import FLAT, Terrain, Tile, terrain_of
 from kiras_rl.tools.viewer.telemetry import Telemetry
@@ -255,7 +255,10 @@ class Cockpit:
         """
         while not self._inbox.empty():
             method, arguments = self._inbox.get()
-            method(*arguments)
+            try:
+                method(*arguments)
+            except PolicyError as error:  # a key for a skill of the policy before
+                self.notice = str(error)
         if self.paused and not self._single_step:
             return None
         self._single_step = False

@@ -50,9 +50,8 @@ class Gamepad:
                 self._take(*_EVENT.unpack(data)[1:])
         except BlockingIOError:
             pass
-        except OSError:  # pulled out
+        except OSError:  # pulled out: nobody holds the stick
             self.close()
-            return
         self._steer()
 
     def close(self) -> None:

@@ -56,7 +56,7 @@ class Loader:
         return ready
 
     def close(self) -> None:
-        """Forget what is waiting; end what is running."""
+        """Forget what is waiting; what is running comes to its end unheard."""
         self._pool.shutdown(wait=False, cancel_futures=True)
 
 
@@ -72,7 +72,8 @@ def load(source: Path) -> OnboardPolicy:
     with TemporaryDirectory() as folder:
         exported = Path(folder) / "policy.onnx"
         # in a process of its own: torch would hold the interpreter for seconds, and the robot
-        command = [sys.executable, "-m", "kiras_rl.tools.export", path, "--out", exported]
+        # -P: what lies in the current folder is not what is installed
+        command = [sys.executable, "-P", "-m", "kiras_rl.tools.export", path, "--out", exported]
         done = subprocess.run(command, capture_output=True, text=True, check=False)
         if done.returncode:
             reason = (done.stderr.strip().splitlines() or ["no reason given"])[-1]

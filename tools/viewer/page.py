@@ -145,6 +145,8 @@ def _free_port(host: str, port: int) -> int:
             probe.bind(address)
             probe.listen()
             return probe.getsockname()[1]
+    except UnicodeError:
+        raise PageError(f"--host {host} is no name of a machine") from None
     except OSError as error:
         if isinstance(error, socket.gaierror) or error.errno != errno.EADDRINUSE:
             raise PageError(f"cannot listen on --host {host}: {error.strerror}") from None

@@ -57,7 +57,7 @@ class Session:
                 heading="Robot and policy",
                 options=lambda: titles,
                 current=lambda: cockpit.title,
-                choose=lambda index: self._choose(choices[index].path, titles[index]),
+                choose=lambda index: cockpit.post(self._choose, choices[index].path, titles[index]),
             )
         )
         self.view.selectors += terrain_selectors(cockpit)

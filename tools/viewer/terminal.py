@@ -102,7 +102,7 @@ def lines(cockpit: Cockpit, view: View) -> list[str]:
         f"{AXES[axis]:>14} {_bar(cockpit.target[axis], cockpit.limits[axis])} "
         f"{cockpit.target[axis]:+.2f}"
         for axis in range(3)
-        if cockpit.limits[axis].any()
+        if cockpit.limits[axis][0] < cockpit.limits[axis][1]
     ]
     if len(kept["time"]):
         last = {name: float(column[-1]) for name, column in kept.items()}

@@ -98,6 +98,12 @@ def test_what_is_posted_waits_for_the_next_step(cockpit):
     assert cockpit.skill == 1
 
 
+def test_a_key_for_a_skill_that_is_not_there_is_no_end(cockpit):
+    cockpit.post(cockpit.choose_skill, 7)
+    assert cockpit.advance() is not None
+    assert "unknown skill '7'" in cockpit.notice
+
+
 def test_a_push_is_felt_and_its_strength_is_as_set(cockpit):
     run(cockpit, 0.5)
     cockpit.push_speed = 0.8

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import struct
 
@@ -62,6 +63,23 @@ def test_the_sticks_drive_and_let_go_of_zero(cockpit, device, pad):
     device.send(AXIS, 1, 900)  # let go, not quite at zero
     device.send(AXIS, 3, 0)
     pad.poll()
+    cockpit.advance()
+    assert not cockpit.target.any()
+
+
+def test_a_pad_that_is_pulled_out_lets_go_of_its_sticks(cockpit, device, pad, monkeypatch):
+    device.send(AXIS, 1, -32767)
+    pad.poll()
+    cockpit.advance()
+    assert cockpit.target[FORWARD] > 0
+
+    def gone(file, size):
+        raise OSError(errno.ENODEV, "No such device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "read", gone)
+        pad.poll()
+    assert not pad.connected
     cockpit.advance()
     assert not cockpit.target.any()
 

@@ -76,6 +76,12 @@ def test_the_screen_says_what_is_and_what_is_asked_for(still_file):
     assert "v_y" not in text  # this policy does not move sideways
 
 
+def test_a_speed_that_cannot_be_changed_is_not_shown(still_file):
+    cockpit = Cockpit(OnboardPolicy(still_file))
+    cockpit.limits[FORWARD] = 0.3
+    assert "v_x" not in lines(cockpit, View())[4]
+
+
 def test_the_screen_names_the_ground_and_counts_tiles(still_file):
     cockpit = Cockpit(OnboardPolicy(still_file), tile=Tile("stairs", 4, 1))
     text = "\n".join(lines(cockpit, View()))
