@@ -52,6 +52,13 @@ def test_finetuning_has_its_changes_and_no_imitation():
     assert list(alone.env.terrain.types) == ["flat", "slopes", "bars", "footholds", "stairs"]
 
 
+def test_the_paper_s_rewards_hold_in_both_phases():
+    paper = load_config("paper")
+    flat, rough = (phase_config(paper, phase) for phase in (SKILL_LEARNING, FINETUNING))
+    assert rough.env.rewards == flat.env.rewards
+    assert paper.finetuning.retention.flat_loss_weight == 0
+
+
 def test_a_run_may_leave_finetuning_out():
     config = load_config("solo8_quick")
     assert phases_of(config) == (SKILL_LEARNING,)

@@ -34,7 +34,7 @@ class AdaBoot:
         self._last = torch.full((num_envs,), float("nan"), device=device)
         self.probability = torch.zeros((), device=device)
         self._ready = False
-        self.uses_estimate = torch.ones(num_envs, dtype=torch.bool, device=device)
+        self.uses_estimate = torch.full((num_envs,), not self.bootstraps_input, device=device)
 
     def record(self, reward: torch.Tensor, done: torch.Tensor) -> None:
         """Add a step's rewards (N,) and dones (N,); in place, as a recorded step has to."""

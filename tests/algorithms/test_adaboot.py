@@ -76,6 +76,7 @@ def test_the_gate_opens_as_often_as_it_trusts(make_adaboot):
 
 def test_the_input_is_the_estimate_in_as_many_worlds_as_it_is_trusted(make_adaboot):
     adaboot = make_adaboot("bootstrap_input")
+    assert not adaboot.uses_estimate.any()
     adaboot.renew()
     assert not adaboot.uses_estimate.any()
     finish_episodes(adaboot, torch.ones(WORLDS))
