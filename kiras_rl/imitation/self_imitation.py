@@ -31,6 +31,7 @@ class SelfImitation:
         config: ImitationConfig,
         keyframe_features: torch.Tensor,
         feature_noise: torch.Tensor,
+        skill_code: torch.Tensor,
         skills: tuple[str, ...],
         num_envs: int,
         num_steps: int,
@@ -41,6 +42,8 @@ class SelfImitation:
             config: See cfg/base.yaml.
             keyframe_features: Phi of each keyframe, (S, D).
             feature_noise: Standard deviation of one unit of instance noise, (D,).
+            skill_code: Which features are the one-hot code of the skill, (D,) bool: there D may be
+                as steep as it likes.
             skills: Names, for the log.
             num_envs: N.
             num_steps: T.
@@ -51,6 +54,7 @@ class SelfImitation:
         self._skills = skills
         self._device = device
         self._noise = feature_noise.repeat(2)
+        self._smooth = ~skill_code.repeat(2)
         self._noise_factor = torch.ones((), device=device)
         half = uses_bfloat16(config.discriminator.precision, device)
         dims = config.discriminator.hidden_dims
@@ -87,6 +91,7 @@ class SelfImitation:
             config,
             env.keyframe_features.to(device),
             env.feature_noise.to(device),
+            _skill_code(env).to(device),
             env.skills,
             len(obs),
             num_steps,
@@ -169,7 +174,7 @@ class SelfImitation:
         weight = self.config.discriminator.gradient_penalty
         if weight > 0:
             loss = loss + weight * gradient_penalty(
-                self.discriminator, *both.chunk(2), features=self._noise > 0
+                self.discriminator, *both.chunk(2), features=self._smooth
             )
         self.optimizer.zero_grad()
         loss.backward()
@@ -210,6 +215,12 @@ class SelfImitation:
         load_adam(self.optimizer, state["optimizer"], self._device)
         self._train.forget()
         self.selector.load_state_dict(state["selector"])
+
+
+def _skill_code(env: SkillEnv) -> torch.Tensor:
+    """Return which features of Phi are the code of the skill, (D,) bool."""
+    parts = [torch.full((size,), name == names.SKILL) for name, size, _ in env.imitation_terms]
+    return torch.cat(parts)
 
 
 def _by_skill(tag: str, skills: tuple[str, ...], values: torch.Tensor) -> dict[str, float]:

@@ -35,6 +35,7 @@ class CountingEnv(SkillEnv):
     skills, step_dt = ("a", "b"), 0.02
     keyframe_features = torch.tensor([[0.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
     feature_noise = torch.full((3,), 0.01)
+    imitation_terms = (("episode", 1, 1.0), ("step", 1, 1.0), ("skill", 1, 1.0))
     keyframe_height, keyframe_pitch = torch.tensor([0.2, 0.3]), torch.zeros(2)
 
     def __init__(self, num_envs=16):

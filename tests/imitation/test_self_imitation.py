@@ -31,7 +31,8 @@ def make_imitation():
         ]
         config = load_config("base", [*small, *overrides]).learner.imitation
         noise = torch.tensor([0.05, 0.05, 0.0, 0.0])
-        return SelfImitation(config, KEYFRAMES, noise, ("a", "b"), WORLDS, STEPS)
+        code = torch.tensor([False, False, True, True])
+        return SelfImitation(config, KEYFRAMES, noise, code, ("a", "b"), WORLDS, STEPS)
 
     return make
 
@@ -137,6 +138,21 @@ def test_steps_that_do_not_count_earn_and_teach_nothing(make_imitation):
     with torch.no_grad():
         score = imitation.discriminator(storage.observations[names.IMITATION][0].repeat(1, 2))
     assert score.min() > 0.5  # only experts pull, and they pull up
+
+
+def test_what_has_no_noise_is_smooth_as_well(make_imitation, monkeypatch):
+    seen = []
+
+    def spy(discriminator, expert, policy, features):
+        seen.append(features.tolist())
+        return torch.zeros(())
+
+    monkeypatch.setattr("kiras_rl.imitation.self_imitation.gradient_penalty", spy)
+    imitation = make_imitation("learner.imitation.discriminator.gradient_penalty=1")
+    imitation._noise = torch.zeros(8)
+    _, storage = rollout(imitation, (1.0, 1.0))
+    imitation.update(storage, 0, progress=0.0)
+    assert seen and all(features == 2 * [True, True, False, False] for features in seen)
 
 
 def test_the_instance_noise_shrinks_with_progress(make_imitation):
