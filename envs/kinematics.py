@@ -12,7 +12,9 @@ import mujoco
 import numpy as np
 import torch
 
-from kiras_rl.robots.robot import Robot
+from kiras_rl.robots.robot import Robot, RobotError
+
+_TOLERANCE = 1e-4  # m
 
 
 class FootKinematics:
@@ -26,13 +28,35 @@ class FootKinematics:
     """
 
     def __init__(self, model: mujoco.MjModel, robot: Robot, device: torch.device) -> None:
-        """Read the chains from the compiled model."""
+        """Read the chains from the compiled model.
+
+        Raises:
+            RobotError: Legs that are no chains of hinges through the origins of parallel frames.
+        """
         chains = [_chain(model, robot, foot) for foot in robot.foot_geoms]
         factors = [_factors(chain["joints"], len(robot.joint_names)) for chain in chains]
         self._factors = torch.tensor(np.concatenate(factors, axis=1), device=device)  # (L, F 3^L)
         coefficients = [torch.tensor(_coefficients(chain), device=device) for chain in chains]
         self._coefficients = torch.block_diag(*coefficients).float()  # (F 3^L, F 3)
         self._radius = robot.foot_radius
+        self._check(model, robot, device)
+
+    def _check(self, model: mujoco.MjModel, robot: Robot, device: torch.device) -> None:
+        """Compare a pose with MuJoCo's."""
+        data = mujoco.MjData(model)
+        joint_pos = robot.default_joint_pos + 0.3
+        data.qpos[:] = np.concatenate([np.zeros(3), [1.0, 0.0, 0.0, 0.0], joint_pos])
+        mujoco.mj_kinematics(model, data)
+        feet = np.array([data.geom(name).xpos for name in robot.foot_geoms])
+        given = torch.tensor(joint_pos, dtype=torch.float32, device=device)
+        mine = self.foot_pos_b(given[None])[0].cpu().numpy()
+        distance = np.linalg.norm(mine - feet, axis=1).max()
+        if distance > _TOLERANCE:
+            raise RobotError(
+                f"{robot.name}: a foot is {100 * distance:.1f} cm from where hinges through the "
+                "origins of its bodies, whose frames are parallel at angle 0, put it: in the MJCF "
+                "leave out pos of the legs' joints and euler, quat and axisangle of their bodies"
+            )
 
     def foot_pos_b(self, joint_pos: torch.Tensor) -> torch.Tensor:
         """Return the centres of the feet in the base frame, (N, F, 3), m.
@@ -65,14 +89,19 @@ class FootKinematics:
 
 def _chain(model: mujoco.MjModel, robot: Robot, foot: str) -> dict[str, list]:
     geom = model.geom(foot)
-    chain: dict[str, list] = {"joints": [], "axes": [], "offsets": [], "foot": list(geom.pos)}
+    chain: dict[str, list] = {"joints": [], "axes": [], "offsets": [], "foot": geom.pos.copy()}
     body = int(geom.bodyid[0])
     base = model.body(robot.base_body).id
     while body != base:
+        if model.body_jntnum[body] == 0:  # welded: a part of what it hangs on
+            ends = chain["offsets"] or [chain["foot"]]
+            ends[0] += model.body_pos[body]
+            body = int(model.body_parentid[body])
+            continue
         joint = model.joint(int(model.body_jntadr[body]))
         chain["joints"].insert(0, robot.joint_names.index(joint.name))
         chain["axes"].insert(0, list(joint.axis))
-        chain["offsets"].insert(0, list(model.body_pos[body]))
+        chain["offsets"].insert(0, model.body_pos[body].copy())
         body = int(model.body_parentid[body])
     return chain
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from kiras_rl.envs.kinematics import FootKinematics
-from kiras_rl.robots.robot import list_robots, load_robot
+from kiras_rl.robots.robot import RobotError, list_robots, load_robot
 
 CPU = torch.device("cpu")
 
@@ -49,6 +49,34 @@ def assert_near(actual, expected):
     """Compare lengths below 1 m; rounding to float32 makes 1e-7 of each."""
     expected = torch.tensor(np.array(expected), dtype=torch.float32)
     torch.testing.assert_close(actual, expected, rtol=0, atol=1e-6)
+
+
+def test_a_foot_may_be_a_body_of_its_own_that_is_welded_on(robot):
+    spec = robot.spec(visuals=False)
+    for name in robot.foot_geoms:
+        geom = next(geom for geom in spec.geoms if geom.name == name)
+        shank, radius = geom.parent, float(geom.size[0])
+        end = geom.pos.copy()
+        spec.delete(geom)
+        foot = shank.add_body(name=f"{name}_body", pos=end / 2)
+        sphere = mujoco.mjtGeom.mjGEOM_SPHERE
+        foot.add_geom(name=name, type=sphere, size=[radius, 0, 0], pos=end / 2)
+    joint_pos = torch.tensor(robot.default_joint_pos).float()[None]
+    models = (spec.compile(), robot.spec(visuals=False).compile())
+    split, whole = (FootKinematics(model, robot, CPU).foot_pos_b(joint_pos) for model in models)
+    torch.testing.assert_close(split, whole, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("what", ["body", "joint"])
+def test_legs_whose_feet_would_be_elsewhere_are_refused(robot, what):
+    spec = robot.spec(visuals=False)
+    shank = next(geom for geom in spec.geoms if geom.name == robot.foot_geoms[0]).parent
+    if what == "body":
+        shank.quat = [0.99, 0.0, 0.14, 0.0]
+    else:
+        shank.joints[0].pos = [0.0, 0.0, 0.01]
+    with pytest.raises(RobotError, match=r"a foot is \d.\d cm from where hinges"):
+        FootKinematics(spec.compile(), robot, CPU)
 
 
 def test_feet_are_where_mujoco_puts_them(robot, model, kinematics, poses):
