@@ -59,7 +59,8 @@ class TaskSampler:
         command = torch.where(renewed[:, None], self.draw_command(), task.command)
         heading = torch.where(renewed, self._draw_heading(command), task.heading)
         skill = torch.where(reset | switch, self.draw_skill(), task.skill)
-        start = torch.where(reset, self.draw_start(skill), task.start)
+        left = torch.where(skill == task.skill, task.start, task.skill)
+        start = torch.where(reset, self.draw_start(skill), left)
         return Task(command=command, skill=skill, start=start, heading=heading)
 
     def steer(self, task: Task, yaw: torch.Tensor) -> Task:

@@ -61,9 +61,12 @@ class Curriculum:
         self._way += speed * dt
         self._gone += made * dt
 
-    def note_switches(self, switched: torch.Tensor) -> None:
-        """Remember in which worlds, (N,) bool, the skill changed within the episode."""
-        self._pure &= ~switched
+    def leave_out(self, worlds: torch.Tensor) -> None:
+        """Let the running episodes of some worlds, (N,) bool, move no level.
+
+        The skill changed within them, or physics broke or ran out of memory.
+        """
+        self._pure &= ~worlds
 
     def update(
         self, done: torch.Tensor, fallen: torch.Tensor, crossed: torch.Tensor, skill: torch.Tensor

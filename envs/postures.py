@@ -39,7 +39,8 @@ class Postures:
         self._action_scale = tensor(robot.action_scale)
         self._keyframes, self._kinematics, self._ground = keyframes, kinematics, ground
         self._config = config
-        self._num_feet = len(robot.foot_geoms)
+        parts = (robot.foot_geoms, robot.base_geoms, robot.penalised_geoms)
+        self._geoms = tuple(len(part) for part in parts)
 
     def joint_targets(self, action: torch.Tensor) -> torch.Tensor:
         """Return what actions (N, J) ask of the joints, (N, J), rad."""
@@ -88,7 +89,7 @@ class Postures:
         skill = torch.arange(count, device=device).repeat_interleave(len(speeds))
         command = torch.zeros(len(skill), 3, device=device)
         command[:, 0] = torch.tensor(speeds, device=device).repeat(count)
-        robot = RobotState.at_rest(self._keyframes, skill, self._num_feet)
+        robot = RobotState.at_rest(self._keyframes, skill, self._geoms)
         task = Task.of(command, skill, skill)
         action = self.holding(robot.joint_pos)
         return View(robot, task, self._keyframes, self.default_joint_pos, action)

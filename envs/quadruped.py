@@ -188,13 +188,16 @@ class QuadrupedEnv(SkillEnv):
         """Do all of a step that follows the physics."""
         self._length = self._length + 1
         self.robot.read_step()
-        invalid = self.sim.diverged | self.sim.overflowed
-        fallen = invalid | terminations.fallen(
+        overflowed = self.sim.overflowed
+        invalid = self.sim.diverged | overflowed
+        fallen = self.sim.diverged | terminations.fallen(
             self.robot, self.task, self.keyframes, self.cfg.terminations
         )
+        fallen = fallen & ~overflowed  # memory ran out: no fault of the policy's
         distance = self._distance()
         crossed = (distance > CROSSED) & (self._ground is not None)  # flat ground has no end
-        time_outs = ((self._length >= self.max_episode_length) | crossed) & ~fallen
+        ends = overflowed | crossed | (self._length >= self.max_episode_length)
+        time_outs = ends & ~fallen
         terms = self._judge(fallen, invalid)
         observer, view = self._observer, self._view()
         extras = {
@@ -210,6 +213,7 @@ class QuadrupedEnv(SkillEnv):
         done = fallen | time_outs
         if self._curriculum:
             self._curriculum.record(self.task, self.robot, self.step_dt)
+            self._curriculum.leave_out(invalid)
             self._curriculum.update(done, fallen, crossed, self.task.skill)
         self._begin_next(done)
         return self._observe(done), terms.sum(dim=1), done, extras
@@ -244,7 +248,7 @@ class QuadrupedEnv(SkillEnv):
         if not self._held:
             task = self._tasks.advance(self.task, done)
             if self._curriculum:
-                self._curriculum.note_switches((task.skill != self.task.skill) & ~done)
+                self._curriculum.leave_out((task.skill != self.task.skill) & ~done)
             self.task = task
         self._last_joint_torque = self.robot.joint_torque.clone()
         self._air_time = (self._air_time + self.step_dt) * ~self.robot.foot_contact
@@ -356,7 +360,8 @@ class QuadrupedEnv(SkillEnv):
     def set_task(self, skill: torch.Tensor, command: torch.Tensor) -> TensorDict:
         """Give every world a new skill and command, which stay until the next call."""
         self._held = True
-        self.task = Task.of(command, skill, self.task.start)
+        start = torch.where(skill == self.task.skill, self.task.start, self.task.skill)
+        self.task = Task.of(command, skill, start)
         return copied(self._observer.change_task(self._view()))
 
     def set_skill_probabilities(self, probabilities: torch.Tensor) -> None:

@@ -48,20 +48,36 @@ class RobotState:
         self._read_contacts()
 
     @classmethod
-    def at_rest(cls, keyframes: Keyframes, skill: torch.Tensor, num_feet: int) -> RobotState:
+    def at_rest(
+        cls, keyframes: Keyframes, skill: torch.Tensor, geoms: tuple[int, int, int]
+    ) -> RobotState:
         """Return robots standing still on the ground in the keyframes `skill`, (N,).
 
-        They belong to no simulation: only base, joints and foot heights are set.
+        They belong to no simulation: forces and torques, which would take one, are 0.
+
+        Args:
+            keyframes: The poses.
+            skill: Which of them, (N,).
+            geoms: Number of feet, of the base's geoms and of those of thighs and shanks.
         """
         robot = cls.__new__(cls)
         zero = torch.zeros(len(skill), 3, device=skill.device)
+        pitch = keyframes.pitch[skill]
+        robot.base_quat_w = rotations.quat_from_pitch_yaw(pitch, torch.zeros_like(pitch))
+        robot._rotation = rotations.matrix(robot.base_quat_w)
+        robot.yaw_rate = torch.zeros_like(pitch)
+        feet, base, limbs = (torch.zeros(len(skill), n, device=skill.device) for n in geoms)
+        robot.foot_force, robot.base_force, robot.limb_force = feet, base, limbs
+        robot.foot_contact = torch.ones_like(feet, dtype=torch.bool)
+        robot.foot_vel_w = zero[:, None].expand(-1, geoms[0], -1)
         robot.base_height = keyframes.height[skill]
         robot.base_lin_vel_b = robot.base_lin_vel_h = robot.base_ang_vel_b = zero
         robot.gravity_b = keyframes.gravity_b[skill]
         robot.roll_pitch = rotations.roll_pitch(robot.gravity_b)
         robot.joint_pos = keyframes.joint_pos[skill]
         robot.joint_vel = torch.zeros_like(robot.joint_pos)
-        robot._foot_height = torch.zeros(len(skill), num_feet, device=skill.device)
+        robot.joint_torque = robot.joint_vel.clone()
+        robot._foot_height = torch.zeros_like(feet)
         robot.base_pos_w = torch.zeros_like(zero)
         robot.base_pos_w[:, 2] = robot.base_height
         robot._ground = None
@@ -148,7 +164,8 @@ class Task:
     Attributes:
         command: v_x, v_y in the heading frame and yaw rate, (N, 3), m/s and rad/s.
         skill: Index of the commanded skill, (N,) int64.
-        start: Index of the keyframe where the episode began, (N,) int64.
+        start: Index of the keyframe that it comes from, (N,) int64: where the episode began, or
+            the skill before.
         heading: Heading that the commanded yaw rate holds, (N,), rad; NaN for none, +inf for that
             of the moment.
     """

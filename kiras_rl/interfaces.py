@@ -47,7 +47,8 @@ NEXT_PROPRIO = "next_proprio"
 """Noise-free `proprio` after the step and before a reset, (N, P); extras, then storage."""
 
 EXTRA_TIME_OUTS = "time_outs"
-"""Episodes that ended by the clock, (N,) bool."""
+"""Episodes that were cut and might have gone on: by the clock, at the edge of a tile, for want of
+memory, (N,) bool."""
 
 EXTRA_IMITATION = "imitation"
 """Phi after the step and before a reset, (N, D)."""

@@ -36,8 +36,8 @@ imitation features, commands and actions of every control step, with names and u
 
 The robots are drawn as kiras-evaluate draws them, by the paper's domain randomization, with sensor
 noise, actuation delay and pushes; what is recorded is what they did, without sensor noise. Each
-episode has a command of its own. It ends after --duration, at a fall, or where the robot is 3.7 m
-from its start along x or y, the edge of a tile.
+episode has a command of its own. It ends after --duration, at a fall or, on terrain, where the
+robot is 3.7 m from its start along x or y, the edge of a tile.
 """
 
 EXAMPLES = """\

@@ -301,6 +301,17 @@ def test_a_lean_is_judged_from_the_nearer_of_target_and_start(build_env):
     assert env.measure().fallen.tolist() == [True, False, False, False]
 
 
+def test_a_lean_that_was_asked_for_before_is_no_fall(build_env):
+    env = build_env("env.terminations.max_tilt=10", *STILL, *NOMINAL, num_envs=1)
+    walk, pitch_down = (torch.tensor([env.skills.index(x)]) for x in ("walk", "pitch_down"))
+    env.reset(walk, torch.zeros(1, 3))
+    env.set_task(pitch_down, torch.zeros(1, 3))
+    place(env, [0], height=0.5, quat=[0.9914, 0.0, 0.1305, 0.0])  # 15 degrees nose down
+    env.set_task(walk, torch.zeros(1, 3))
+    env.step(hold(env))
+    assert not env.measure().fallen.any()
+
+
 def test_a_world_whose_physics_breaks_ends_and_harms_no_other(env):
     for _ in range(3):
         env.step(actions(env))

@@ -6,6 +6,8 @@ import pytest
 import torch
 
 from kiras_rl.config import ConfigError, load_config
+from kiras_rl.envs import observations
+from kiras_rl.envs.observations import View
 from kiras_rl.interfaces import COMMAND, CRITIC, HISTORY, IMITATION, NEXT_PROPRIO, PROPRIO
 from kiras_rl.runner import KirasRunner
 
@@ -196,6 +198,23 @@ def test_a_robot_in_a_keyframe_shows_the_keyframe_s_features(build_env, cfg):
     obs = env.reset(skills, torch.zeros(5, 3))
     # a robot is put down 2 mm above the ground, and lengths are scaled by 10
     torch.testing.assert_close(obs[IMITATION], env.keyframe_features, atol=0.021, rtol=0)
+
+
+def test_a_critic_may_see_all_that_a_robot_has(build_env, monkeypatch):
+    def everything(view: View) -> torch.Tensor:
+        robot = view.robot
+        parts = (robot.foot_contact, robot.foot_force, robot.base_force, robot.limb_force,
+                 robot.foot_vel_w.flatten(1), robot.joint_torque, robot.base_quat_w,
+                 robot.yaw_rate[:, None], robot.yaw[:, None])  # fmt: skip
+        return torch.cat([part.float() for part in parts], dim=1)
+
+    monkeypatch.setattr(observations, "everything", everything, raising=False)
+    env = build_env("env.observations.critic.everything={}", num_envs=5)
+    at_rest, seen = env.keyframe_observations(), env.get_observations()[CRITIC]
+    assert at_rest.shape[-1] == seen.shape[1] == 107 + 43
+    pitch = env.keyframe_pitch[:, None, None]
+    assert (at_rest[..., 107:111] == 1.0).all()  # feet on the ground
+    torch.testing.assert_close(at_rest[..., -4:-3], (pitch / 2).sin().expand(5, 3, 1))  # y of it
 
 
 def test_keyframes_are_judged_at_rest_for_several_commands(build_env):

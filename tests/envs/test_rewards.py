@@ -31,7 +31,7 @@ def row(*values):
 
 def crafted(command=(0.5, 0.0, 0.2), fresh=False, fallen=False):
     """Return a step of one world with two joints, two feet and two other geoms."""
-    robot = RobotState.at_rest(KEYFRAMES, torch.tensor([CRAWL]), num_feet=2)
+    robot = RobotState.at_rest(KEYFRAMES, torch.tensor([CRAWL]), geoms=(2, 1, 2))
     robot.base_height = torch.tensor([0.15])
     robot.gravity_b = row(0.6, 0.0, -0.8)
     robot.base_lin_vel_h = row(0.3, -0.1, 0.05)

@@ -101,6 +101,26 @@ def test_leaving_the_tile_ends_an_episode_by_the_clock(env):
     assert env.robot.base_pos_w[:2, :2].abs().max() < 0.1  # they begin again in the middle
 
 
+def test_worlds_that_run_out_of_memory_end_without_a_fall(env):
+    curriculum = env._curriculum
+    before = curriculum.level.clone()
+    curriculum._way.fill_(2.0)  # and have not gone any of it: stuck, they would lose a level
+    step = env.sim.step
+
+    def overflow(targets):
+        step(targets)
+        env.sim.overflowed[:3] = True
+
+    env.sim.step = overflow
+    _, rewards, done, extras = env.step(holding(env))
+    assert done[:3].all()
+    assert torch.equal(extras["time_outs"][:3], done[:3])
+    assert not extras["imitation_valid"][:3].any()
+    assert (rewards[:3] > -1.0).all()  # a fall costs 2
+    assert extras["log"]["Episode/falls"] == 0
+    assert torch.equal(curriculum.level, before)
+
+
 def test_a_held_heading_is_steered_for(env):
     index = torch.zeros(8, dtype=torch.int64)
     command = torch.tensor([0.3, 0.0, 0.0]).expand(8, 3)
