@@ -104,7 +104,8 @@ def resume(source: Path, overrides: list[str]) -> KirasRunner:
             f"iterations={config.iterations}: the skill learning of this run is over, after "
             f"{values['iterations']}; finetuning.iterations may change"
         )
-    check(config)
+    if phase == SKILL_LEARNING:
+        check(config)
     runner = build(config, run_dir, phase)
     runner.load(str(source))
     return runner
