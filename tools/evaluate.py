@@ -44,7 +44,7 @@ examples:
   kiras-evaluate runs/solo8_quick/2026-01-31_12-00-00
   kiras-evaluate policy.onnx --protocol imitation,transitions
   kiras-evaluate policy.onnx --protocol terrain --levels 4,5 --trials 100
-  kiras-evaluate policy.onnx --protocol heat_map   an hour or two on two CPU cores
+  kiras-evaluate policy.onnx --protocol heat_map   twenty minutes on two CPU cores
 """
 
 MISTAKES = (CheckpointError, ConfigError, OSError, PolicyError, RobotError)
