@@ -59,8 +59,8 @@ class TaskSampler:
         command = torch.where(renewed[:, None], self.draw_command(), task.command)
         heading = torch.where(renewed, self._draw_heading(command), task.heading)
         skill = torch.where(reset | switch, self.draw_skill(), task.skill)
-        left = torch.where(skill == task.skill, task.start, task.skill)
-        start = torch.where(reset, self.draw_start(skill), left)
+        before = torch.where(switch, task.skill, task.start)
+        start = torch.where(reset, self.draw_start(skill), before)
         return Task(command=command, skill=skill, start=start, heading=heading)
 
     def steer(self, task: Task, yaw: torch.Tensor) -> Task:

@@ -61,12 +61,12 @@ class Curriculum:
         self._way += speed * dt
         self._gone += made * dt
 
-    def leave_out(self, worlds: torch.Tensor) -> None:
-        """Let the running episodes of some worlds, (N,) bool, move no level.
+    def keep_counting(self, worlds: torch.Tensor) -> None:
+        """Let only the running episodes of some worlds, (N,) bool, move a level.
 
-        The skill changed within them, or physics broke or ran out of memory.
+        In the others the skill changed, or physics broke or ran out of memory.
         """
-        self._pure &= ~worlds
+        self._pure &= worlds
 
     def update(
         self, done: torch.Tensor, fallen: torch.Tensor, crossed: torch.Tensor, skill: torch.Tensor

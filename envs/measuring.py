@@ -17,7 +17,8 @@ def measure(robot: RobotState, distance: torch.Tensor, fallen: torch.Tensor) -> 
     Args:
         robot: The robots after the step.
         distance: From the middle of the tile, (N,), m.
-        fallen: Worlds that terminate by failure, (N,) bool.
+        fallen: Worlds that terminate by failure, or whose physics broke or ran out of memory:
+            what comes after is another life, (N,) bool.
     """
     return Measurements(
         base_pos_w=robot.base_pos_w.clone(),

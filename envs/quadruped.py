@@ -188,16 +188,15 @@ class QuadrupedEnv(SkillEnv):
         """Do all of a step that follows the physics."""
         self._length = self._length + 1
         self.robot.read_step()
-        overflowed = self.sim.overflowed
-        invalid = self.sim.diverged | overflowed
+        invalid = self.sim.diverged | self.sim.overflowed
         fallen = self.sim.diverged | terminations.fallen(
             self.robot, self.task, self.keyframes, self.cfg.terminations
         )
-        fallen = fallen & ~overflowed  # memory ran out: no fault of the policy's
         distance = self._distance()
         crossed = (distance > CROSSED) & (self._ground is not None)  # flat ground has no end
-        ends = overflowed | crossed | (self._length >= self.max_episode_length)
-        time_outs = ends & ~fallen
+        # Memory that ran out is no fault of the policy's: the episode is cut.
+        cut = self.sim.overflowed | crossed | (self._length >= self.max_episode_length)
+        time_outs = cut & ~fallen
         terms = self._judge(fallen, invalid)
         observer, view = self._observer, self._view()
         extras = {
@@ -208,12 +207,12 @@ class QuadrupedEnv(SkillEnv):
             names.NEXT_PROPRIO: _unless(invalid, observer.proprio(view), observer.clean),
             "log": self._log(terms, fallen, time_outs),
         }
-        self._measurements = measure(self.robot, distance, fallen)
+        self._measurements = measure(self.robot, distance, fallen | invalid)
 
         done = fallen | time_outs
         if self._curriculum:
             self._curriculum.record(self.task, self.robot, self.step_dt)
-            self._curriculum.leave_out(invalid)
+            self._curriculum.keep_counting(extras[names.EXTRA_VALID])
             self._curriculum.update(done, fallen, crossed, self.task.skill)
         self._begin_next(done)
         return self._observe(done), terms.sum(dim=1), done, extras
@@ -248,7 +247,7 @@ class QuadrupedEnv(SkillEnv):
         if not self._held:
             task = self._tasks.advance(self.task, done)
             if self._curriculum:
-                self._curriculum.leave_out((task.skill != self.task.skill) & ~done)
+                self._curriculum.keep_counting((task.skill == self.task.skill) | done)
             self.task = task
         self._last_joint_torque = self.robot.joint_torque.clone()
         self._air_time = (self._air_time + self.step_dt) * ~self.robot.foot_contact

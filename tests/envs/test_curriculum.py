@@ -104,7 +104,7 @@ def test_the_way_of_an_episode_begins_at_its_reset(curriculum):
 
 
 def test_episodes_in_which_the_skill_changed_do_not_count(curriculum):
-    curriculum.leave_out(flags(3))
+    curriculum.keep_counting(~flags(3))
     curriculum.update(flags(3, 4), flags(), flags(3, 4), skills())
     assert curriculum.level[:, 0].tolist() == [0, 0, 0, 0, 1, 0, 0, 0, 0, 0]
     curriculum.update(flags(3), flags(), flags(3), skills())  # the next episode does

@@ -119,6 +119,8 @@ def test_worlds_that_run_out_of_memory_end_without_a_fall(env):
     assert (rewards[:3] > -1.0).all()  # a fall costs 2
     assert extras["log"]["Episode/falls"] == 0
     assert torch.equal(curriculum.level, before)
+    # whoever evaluates may not take the next life for the same one
+    assert env.measure().fallen.tolist() == 3 * [True] + 5 * [False]
 
 
 def test_a_held_heading_is_steered_for(env):
