@@ -28,6 +28,7 @@ POSITIVE = (
     "learner.imitation.premium.capacity",
     "learner.imitation.premium.per_iteration",
     "learner.estimator.epochs",
+    "learner.estimator.full_rate_std",
     "evaluation.worlds_per_skill",
     "evaluation.terrain.robots",
     "finetuning.iterations",

@@ -178,6 +178,7 @@ class EstimatorConfig:
     encoder_dims: list[int]
     decoder_dims: list[int]
     learning_rate: float
+    full_rate_std: float
     epochs: int
     kl_weight: float
     prior_weight: float

@@ -87,9 +87,10 @@ class Estimation:
             context = torch.cat([velocity, context[:, VELOCITY_DIM:]], dim=-1)
         return context
 
-    def scale_steps(self, factor: float) -> None:
-        """Take steps of this share of the configured size from now on."""
-        self._learning_rate.fill_(factor * self.config.learning_rate)
+    def scale_steps(self, action_std: float) -> None:
+        """Take steps from now on that fit an action noise; see `full_rate_std` of cfg/base.yaml."""
+        share = min(1.0, action_std / self.config.full_rate_std)
+        self._learning_rate.fill_(share * self.config.learning_rate)
 
     def record(self, rewards: torch.Tensor, dones: torch.Tensor) -> None:
         """Let AdaBoot see a step's rewards and dones, (N,)."""

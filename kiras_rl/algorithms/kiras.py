@@ -30,9 +30,6 @@ from kiras_rl.recorded import Recorded
 from kiras_rl.schedules import advantage_weights, piecewise_linear
 from kiras_rl.schema import LearnerConfig
 
-FULL_STEPS_STD = 0.5
-"""Action noise from which on the estimator takes steps of the configured size."""
-
 TASK, IMITATION = 0, 1  # reward groups
 
 
@@ -248,7 +245,7 @@ class KirasPPO(PPO):
         self.actor.distribution.std_param.fill_(std)
         self.desired_kl.fill_(piecewise_linear(self.config.ppo.desired_kl, self.progress))
         if self.estimation:
-            self.estimation.scale_steps(min(1.0, std / FULL_STEPS_STD))
+            self.estimation.scale_steps(std)
 
     # --- skills ---------------------------------------------------------------------------------
 

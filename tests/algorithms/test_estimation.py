@@ -22,7 +22,8 @@ def make_estimation():
 
     def make(adaboot="off", floor=0.0):
         config = EstimatorConfig(
-            latent_dim=LATENT, encoder_dims=[32], decoder_dims=[32], learning_rate=3e-3, epochs=1,
+            latent_dim=LATENT, encoder_dims=[32], decoder_dims=[32], learning_rate=3e-3,
+            full_rate_std=0.5, epochs=1,
             kl_weight=0.01, prior_weight=1e-3, adaboot=adaboot, adaboot_floor=floor,
         )  # fmt: skip
         network = ContextEstimator(PROPRIO, FRAMES, SKILLS, LATENT, [32], [32])
