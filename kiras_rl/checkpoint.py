@@ -12,6 +12,7 @@ from pathlib import Path
 import torch
 
 from kiras_rl import __version__, distributed
+from kiras_rl.files import replacing
 from kiras_rl.models.exported import ExportedPolicy, build_policy
 
 FORMAT = 3
@@ -44,16 +45,10 @@ def save_checkpoint(path: Path, content: dict) -> None:
         path: Where to.
         content: Tensors, numbers, strings, and containers of them.
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        with temporary.open("wb") as file:
-            torch.save({"format": FORMAT, "versions": versions()} | content, file)
-            file.flush()
-            os.fsync(file.fileno())
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    with replacing(path) as temporary, temporary.open("wb") as file:
+        torch.save({"format": FORMAT, "versions": versions()} | content, file)
+        file.flush()
+        os.fsync(file.fileno())
 
 
 def load_checkpoint(path: Path) -> dict:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import difflib
-import os
 from dataclasses import asdict
 from functools import cache
 from pathlib import Path
@@ -13,6 +12,7 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from kiras_rl.files import replacing
 from kiras_rl.ranges import find_mistake
 from kiras_rl.schema import Config
 
@@ -79,9 +79,8 @@ def config_to_dict(config: Config) -> dict:
 
 def save_config(config: Config, path: Path) -> None:
     """Write a configuration as YAML, whole or not at all."""
-    temporary = path.with_name(f".{path.name}.{os.getpid()}")
-    temporary.write_text(OmegaConf.to_yaml(config_to_dict(config)), encoding="utf-8")
-    temporary.replace(path)
+    with replacing(path) as temporary:
+        temporary.write_text(OmegaConf.to_yaml(config_to_dict(config)), encoding="utf-8")
 
 
 def check_resume_overrides(overrides: list[str]) -> None:

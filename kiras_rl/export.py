@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import copy
 import logging
-import os
 import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
+from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,6 +16,7 @@ import torch
 from torch import nn
 
 from kiras_rl.deploy.metadata import METADATA_KEY, PolicyMetadata
+from kiras_rl.files import replacing
 
 if TYPE_CHECKING:
     import onnx
@@ -42,7 +43,7 @@ class ExportReport:
 def export_policy(
     policy: nn.Module,
     metadata: PolicyMetadata | Mapping[str, Any],
-    path: str | os.PathLike[str],
+    path: str | PathLike[str],
     check_inputs: int = 1000,
 ) -> ExportReport:
     """Write a policy as one ONNX file that carries its own description.
@@ -72,7 +73,8 @@ def export_policy(
             f"at most {MAX_DIFFERENCE:g} is accepted"
         )
     path = Path(path)
-    _write_atomically(path, data)
+    with replacing(path) as temporary:
+        temporary.write_bytes(data)
     return ExportReport(path, len(data), difference, check_inputs)
 
 
@@ -171,13 +173,3 @@ def _largest_difference(
     pairs = zip(outputs, expected, strict=True)
     differences = [(torch.from_numpy(given) - wanted).abs().max() for given, wanted in pairs]
     return torch.stack(differences).max().item()  # NaN, too, comes through this maximum
-
-
-def _write_atomically(path: Path, data: bytes) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")  # same folder: rename is atomic
-    try:
-        temporary.write_bytes(data)
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)

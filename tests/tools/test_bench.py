@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 import sys
 import time
 from itertools import pairwise
@@ -239,9 +240,10 @@ def test_more_skills_than_a_robot_has_are_its_own_again():
 @pytest.fixture
 def stand_in(tmp_path):
     """An interpreter that answers as mjlab's script does: 5 s for the steps of every round."""
-    path = tmp_path / "python"
-    path.write_text(
-        f"#!{sys.executable}\n"
+    path, script = tmp_path / "python", tmp_path / "stand_in.py"
+    # not in the first line of the script: there a path must not hold a space
+    path.write_text(f'#!/bin/sh\nexec {shlex.quote(sys.executable)} {script} "$@"\n')
+    script.write_text(
         "import json, sys\n"
         "about = {'task': 'none', 'versions': {'arguments': ' '.join(sys.argv[2:])}}\n"
         "print(json.dumps(about), flush=True)\n"
@@ -295,11 +297,11 @@ def test_the_report_says_where_and_with_what_it_was_measured(bench):
     ("arguments", "message"),
     [
         (("--parts=speed",), "no part 'speed'; there are physics, terrain, learning, iteration"),
-        (("--worlds=8,x",), "'x' is not a number of at least 1"),
+        (("--worlds=8,x",), "'x': give a whole number, at least 1"),
         (("--parts=peer",), "the part peer needs --peer PYTHON"),
         (("--plot",), "--plot needs --out FOLDER"),
-        (("--worlds=0",), "'0' is not a number of at least 1"),
-        (("--rounds=many",), "'many' is not a number of at least 1"),
+        (("--worlds=0",), "'0': give a whole number, at least 1"),
+        (("--rounds=many",), "'many': give a whole number, at least 1"),
     ],
 )
 def test_a_wrong_argument_is_explained(arguments, message, capsys):

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Callable
 from pathlib import Path
 
 from filelock import FileLock
 
 from kiras_rl.config import ConfigError
+from kiras_rl.files import replacing
 
 FILE = "results.json"
 
@@ -88,6 +88,5 @@ class Ledger:
         """Add results to those on file, whole or not at all."""
         with FileLock(self.path.with_name(f".{FILE}.lock")):
             self.content["results"] = self._read() | new
-            temporary = self.path.with_name(f".{FILE}.{os.getpid()}")
-            temporary.write_text(json.dumps(self.content, indent=1) + "\n", encoding="utf-8")
-            temporary.replace(self.path)
+            with replacing(self.path) as temporary:
+                temporary.write_text(json.dumps(self.content, indent=1) + "\n", encoding="utf-8")
