@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import math
 import time
 from collections.abc import Callable
 from contextlib import nullcontext
@@ -12,8 +11,6 @@ from pathlib import Path
 
 import torch
 from rsl_rl.runners import OnPolicyRunner
-from rsl_rl.utils import check_nan
-from tensordict import TensorDict
 from torch.utils.tensorboard import SummaryWriter
 
 from kiras_rl import __version__, checkpoint, distributed
@@ -27,13 +24,11 @@ from kiras_rl.interfaces import SkillEnv
 from kiras_rl.phases import SKILL_LEARNING, rsl_rl_config, total_iterations
 from kiras_rl.process import StopRequest, generator_states, set_generator_states, single_threaded
 from kiras_rl.schema import Config
+from kiras_rl.soundness import TrainingError, check_rollout, check_update
 from kiras_rl.status import Status
 
 COUNTS = ("Episode/", "Sim/")
 """Tags of numbers that are added up, over the steps of a rollout and over the ranks."""
-
-LOSSES = ("Loss/", "Policy/", "Estimator/", "Discriminator/")
-"""Tags of an update that are numbers as long as its weights are."""
 
 ANEW = (
     "%s is of a run with %d rank(s), this one has %d: networks, optimizers, premium buffer and "
@@ -41,10 +36,6 @@ ANEW = (
 )
 
 _log = logging.getLogger(__name__)
-
-
-class TrainingError(ValueError):
-    """A training that cannot go on: says where it broke and what is left."""
 
 
 @dataclass(frozen=True)
@@ -158,13 +149,22 @@ class KirasRunner(OnPolicyRunner):
         return finished
 
     def _iterate(self) -> Status:
+        try:
+            return self._collect_and_learn()
+        except TrainingError as error:
+            raise TrainingError(
+                f"iteration {self.current_learning_iteration + 1}: {error}; "
+                f"the last checkpoint stays as it is ({self.run_dir})"
+            ) from None
+
+    def _collect_and_learn(self) -> Status:
         begin = time.perf_counter()
         log = self._rollout()
         collected = time.perf_counter()
         scalars = self.alg.update()
         self._renew_skill_probabilities(scalars)
         learned = time.perf_counter()
-        self._check_update(scalars)
+        check_update(scalars)
         self.current_learning_iteration += 1
         steps = self.env.num_envs * self.cfg["num_steps_per_env"] * distributed.size()
         self.steps += steps
@@ -210,34 +210,9 @@ class KirasRunner(OnPolicyRunner):
                 log = extras["log"]  # the same names in every step
                 totals = totals + torch.stack(tuple(log.values())) if log else totals
         self.alg.compute_returns(obs)
-        # Once a rollout: every check waits for the device. NaN in an earlier step is still there,
-        # in the history of observations or in rewards, which hold values of time-outs.
-        self._check_finite(obs)
+        check_rollout(obs, self.alg.storage)
         values = zip(log, totals.tolist(), strict=True) if log else ()
         return {k: v if k.startswith(COUNTS) else v / num_steps for k, v in values}
-
-    def _check_finite(self, obs: TensorDict) -> None:
-        fault = ""
-        try:
-            check_nan(obs, self.alg.storage.rewards, self.alg.storage.dones)
-        except ValueError as error:
-            fault = str(error)
-        self._stop_at(fault, "Worlds that diverge are reset before this, so look at your own terms")
-
-    def _check_update(self, scalars: dict[str, float]) -> None:
-        """Refuse weights that are no numbers: worlds they break are reset, and look sound."""
-        broken = [k for k, v in scalars.items() if k.startswith(LOSSES) and not math.isfinite(v)]
-        fault = f"{', '.join(broken)} not finite." if broken else ""
-        self._stop_at(fault, "Look at the learning rates of learner")
-
-    def _stop_at(self, fault: str, advice: str) -> None:
-        if distributed.any_rank(bool(fault)):
-            raise TrainingError(
-                f"iteration {self.current_learning_iteration + 1}: "
-                f"{fault or 'Another rank met values that are not finite.'} {advice}, or lower "
-                "learner.ppo.learning_rate; "
-                f"the last checkpoint stays as it is ({self.run_dir})"
-            )
 
     def _renew_skill_probabilities(self, scalars: dict[str, float]) -> None:
         probabilities = self.alg.skill_probabilities(self.env.keyframe_observations())

@@ -14,7 +14,8 @@ from kiras_rl.config import list_configs, load_config
 from kiras_rl.envs import make_env
 from kiras_rl.phases import FINETUNING, SKILL_LEARNING, phase_config
 from kiras_rl.process import StopRequest
-from kiras_rl.runner import Evaluators, KirasRunner, TrainingError
+from kiras_rl.runner import Evaluators, KirasRunner
+from kiras_rl.soundness import TrainingError
 
 # Noise, randomization and delay are on; episodes and premium windows end many times.
 TINY = (

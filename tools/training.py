@@ -24,8 +24,9 @@ from kiras_rl.phases import (
 )
 from kiras_rl.process import StopRequest
 from kiras_rl.robots.robot import RobotError
-from kiras_rl.runner import KirasRunner, TrainingError
+from kiras_rl.runner import KirasRunner
 from kiras_rl.schema import Config
+from kiras_rl.soundness import TrainingError
 from kiras_rl.tools.curves import draw_curves
 from kiras_rl.tools.evaluator import check_terrain, make_evaluators, onboard_policy
 from kiras_rl.tools.flat_policy import check_fit, read_flat, sizes
