@@ -22,6 +22,7 @@ from kiras_rl.config import ConfigError, load_config
 from kiras_rl.deploy.policy import PolicyError
 from kiras_rl.robots.robot import RobotError
 from kiras_rl.schema import Config
+from kiras_rl.tools.arguments import at_least
 from kiras_rl.tools.benchmarks import (
     bound,
     contacts,
@@ -130,7 +131,9 @@ def _parse(argv: list[str] | None) -> argparse.Namespace:
         metavar="N[,N...]",
         help=f"scale takes all of them, the other parts the first (default: {WORLDS})",
     )
-    parser.add_argument("--rounds", type=_count, default=5, help="that are measured (default: 5)")
+    parser.add_argument(
+        "--rounds", type=at_least(1), default=5, help="that are measured (default: 5)"
+    )
     parser.add_argument(
         "--parts", type=_parts, metavar="PART[,PART...]", help=f"(default: {','.join(USUAL)})"
     )
@@ -152,14 +155,8 @@ def _parse(argv: list[str] | None) -> argparse.Namespace:
     return args
 
 
-def _count(text: str) -> int:
-    if not text.isdecimal() or int(text) < 1:
-        raise argparse.ArgumentTypeError(f"'{text}' is not a number of at least 1")
-    return int(text)
-
-
 def _counts(text: str) -> tuple[int, ...]:
-    return tuple(_count(word) for word in text.split(","))
+    return tuple(at_least(1)(word) for word in text.split(","))
 
 
 def _parts(text: str) -> tuple[str, ...]:

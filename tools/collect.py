@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import math
 import shlex
 import sys
 from collections.abc import Sequence
@@ -20,6 +19,7 @@ from kiras_rl.deploy.policy import PolicyError, PolicyMetadata
 from kiras_rl.phases import FINETUNING, SKILL_LEARNING, phase_config
 from kiras_rl.robots.robot import RobotError
 from kiras_rl.schema import Config
+from kiras_rl.tools.arguments import at_least, seconds_above
 from kiras_rl.tools.collector import Plan, Range, collect
 from kiras_rl.tools.evaluator import (
     evaluation_physics,
@@ -85,8 +85,10 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--out", type=Path, required=True, metavar="FOLDER", help="new folder")
     parser.add_argument("--format", choices=MANY, default="npz", help="of the dataset (npz)")
     parser.add_argument("--skills", metavar="NAME,...", help="of the policy (all)")
-    parser.add_argument("--episodes", type=_count, default=10, help="of each skill (10)")
-    parser.add_argument("--duration", type=_seconds, default=10.0, help="of an episode, s (10)")
+    parser.add_argument("--episodes", type=at_least(1), default=10, help="of each skill (10)")
+    parser.add_argument(
+        "--duration", type=seconds_above(0), default=10.0, help="of an episode, s (10)"
+    )
     parser.add_argument(
         "--command",
         type=_command,
@@ -94,7 +96,7 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
         metavar="V_X[,V_Y[,YAW]]",
         help="m/s, m/s, rad/s; each a number or a range LOW:HIGH to draw from (0.3)",
     )
-    parser.add_argument("--seed", type=_seed, default=0, help="of robots and commands (0)")
+    parser.add_argument("--seed", type=at_least(0), default=0, help="of robots and commands (0)")
     parser.add_argument("--nominal", action="store_true", help="no randomization, noise or pushes")
     parser.add_argument(
         "--terrain", default="flat", metavar="TYPE[:LEVEL]", help="the heading is held there (flat)"
@@ -183,28 +185,6 @@ def _command(text: str) -> tuple[Range, ...]:
             f"'{text}': give v_x[,v_y[,yaw_rate]], each a number or LOW:HIGH, as in 0.1:0.5,0,0.3"
         )
     return (*pairs, *(3 - len(pairs)) * [(0.0, 0.0)])
-
-
-def _count(text: str) -> int:
-    if not text.isdecimal() or int(text) < 1:
-        raise argparse.ArgumentTypeError(f"'{text}': give a whole number, at least 1")
-    return int(text)
-
-
-def _seed(text: str) -> int:
-    if not text.isdecimal():
-        raise argparse.ArgumentTypeError(f"'{text}': give a whole number, at least 0")
-    return int(text)
-
-
-def _seconds(text: str) -> float:
-    try:
-        seconds = float(text)
-    except ValueError:
-        seconds = math.nan
-    if not 0 < seconds < math.inf:
-        raise argparse.ArgumentTypeError(f"'{text}': give seconds, more than 0")
-    return seconds
 
 
 if __name__ == "__main__":

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import math
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -16,6 +15,7 @@ from kiras_rl.config import ConfigError
 from kiras_rl.deploy.metadata import PolicyError
 from kiras_rl.evaluation.flat import SETTLE
 from kiras_rl.robots.robot import RobotError
+from kiras_rl.tools.arguments import at_least, seconds_above
 from kiras_rl.tools.protocols import PROTOCOLS, known
 from kiras_rl.tools.protocols.subject import Options, Subject
 from kiras_rl.tools.protocols.terrain import LEVELS
@@ -153,13 +153,14 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     )
     default = Options()
     parser.add_argument(
-        "--robots", type=_count, default=default.robots,
+        "--robots", type=at_least(1), default=default.robots,
         help="robots a skill (flat, imitation, robustness)",
     )  # fmt: skip
     parser.add_argument(
-        "--duration", type=_duration, default=default.duration, help="s a robot (flat)"
-    )
-    parser.add_argument("--trials", type=_count, help="of a cell (the others)")
+        "--duration", type=seconds_above(SETTLE), default=default.duration,
+        help=f"s a robot (flat); the first {SETTLE:g} is not counted",
+    )  # fmt: skip
+    parser.add_argument("--trials", type=at_least(1), help="of a cell (the others)")
     parser.add_argument(
         "--levels", type=_levels, default=default.levels, help="of terrain, 0 to 10, as in 2,4,6"
     )
@@ -200,24 +201,6 @@ def _protocols(text: str) -> list[str]:
             f"unknown protocol '{unknown[0]}'; allowed are all, {', '.join(PROTOCOLS)}"
         )
     return names
-
-
-def _count(text: str) -> int:
-    if not text.isdigit() or int(text) < 1:
-        raise argparse.ArgumentTypeError(f"'{text}': give a number of at least 1")
-    return int(text)
-
-
-def _duration(text: str) -> float:
-    try:
-        seconds = float(text)
-    except ValueError:
-        seconds = math.nan
-    if not SETTLE < seconds < math.inf:
-        raise argparse.ArgumentTypeError(
-            f"'{text}': give seconds, more than the first {SETTLE:g}, which is not counted"
-        )
-    return seconds
 
 
 def _levels(text: str) -> tuple[int, ...]:

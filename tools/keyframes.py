@@ -18,7 +18,7 @@ from rich.table import Table
 
 from kiras_rl.robots.robot import Keyframe, Robot, RobotError, load_robot
 from kiras_rl.robots.statics import KeyframeReport, examine_keyframe
-from kiras_rl.tools.outputs import PICTURES, file_of
+from kiras_rl.tools.arguments import PICTURES, file_of
 from kiras_rl.tools.rendering import RenderError, make_renderer
 
 TILE = (420, 340)
@@ -170,6 +170,7 @@ def _camera(model: mujoco.MjModel, data: mujoco.MjData, robot: Robot) -> mujoco.
 def _save_picture(reports: list[KeyframeReport], out: Path | None) -> bool:
     """Draw and save; False where a picture was asked for and there is no OpenGL."""
     path = out or Path("runs", "keyframes", f"{reports[0].robot.name}.png")
+    path.parent.mkdir(parents=True, exist_ok=True)
     try:
         figure = draw(reports)
     except RenderError as error:
@@ -178,7 +179,6 @@ def _save_picture(reports: list[KeyframeReport], out: Path | None) -> bool:
             return True
         _fail(str(error))
         return False
-    path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path)
     print(f"picture: {path}")
     return True

@@ -13,9 +13,9 @@ from kiras_rl.config import ConfigError
 from kiras_rl.deploy.policy import PolicyError
 from kiras_rl.robots.robot import RobotError
 from kiras_rl.tools import policy_files, summary
+from kiras_rl.tools.arguments import PICTURES, file_of
 from kiras_rl.tools.driver import Driver
 from kiras_rl.tools.ground import FLAT, terrain_of
-from kiras_rl.tools.outputs import PICTURES, file_of
 from kiras_rl.tools.rendering import RenderError
 from kiras_rl.tools.script import (
     Segment,

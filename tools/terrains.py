@@ -22,7 +22,7 @@ from kiras_rl.envs.terrain_library import TerrainLibrary, build_library
 from kiras_rl.phases import FINETUNING, phase_config
 from kiras_rl.robots.robot import Robot, RobotError, load_robot
 from kiras_rl.schema import Config
-from kiras_rl.tools.outputs import PICTURES, file_of
+from kiras_rl.tools.arguments import PICTURES, file_of
 from kiras_rl.tools.rendering import RenderError, make_renderer
 from kiras_rl.tools.terrain_budgets import measure_budgets
 
@@ -60,13 +60,9 @@ def main(argv: list[str] | None = None) -> int:
         return 0
     path = arguments.out or Path("runs", "terrains", f"{robot.name}.png")
     try:
-        figure = draw(robot, library)
-    except RenderError as error:
-        return _fail(str(error))
-    try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        figure.savefig(path)
-    except OSError as error:
+        draw(robot, library).savefig(path)
+    except (OSError, RenderError) as error:
         return _fail(str(error))
     print(f"picture: {path}")
     return 0

@@ -20,7 +20,7 @@ KEYFRAMES = torch.tensor([[0.0, 0.0, 1.0, 0.0], [1.0, 0.0, 0.0, 1.0]])  # two nu
 def make_imitation():
     """Return a function that builds a small discriminator taught by keyframes alone."""
 
-    def make(*overrides):
+    def make(*overrides, noise=0.05):
         small = [
             "learner.imitation.discriminator.hidden_dims=[32]",
             "learner.imitation.discriminator.updates=10",
@@ -30,7 +30,7 @@ def make_imitation():
             "learner.imitation.reward_weight=2",
         ]
         config = load_config("base", [*small, *overrides]).learner.imitation
-        noise = torch.tensor([0.05, 0.05, 0.0, 0.0])
+        noise = torch.tensor([noise, noise, 0.0, 0.0])
         code = torch.tensor([False, False, True, True])
         return SelfImitation(config, KEYFRAMES, noise, code, ("a", "b"), WORLDS, STEPS)
 
@@ -148,8 +148,8 @@ def test_what_has_no_noise_is_smooth_as_well(make_imitation, monkeypatch):
         return torch.zeros(())
 
     monkeypatch.setattr("kiras_rl.imitation.self_imitation.gradient_penalty", spy)
-    imitation = make_imitation("learner.imitation.discriminator.gradient_penalty=1")
-    imitation._noise = torch.zeros(8)
+    weight = "learner.imitation.discriminator.gradient_penalty=1"
+    imitation = make_imitation(weight, noise=0.0)
     _, storage = rollout(imitation, (1.0, 1.0))
     imitation.update(storage, 0, progress=0.0)
     assert seen and all(features == 2 * [True, True, False, False] for features in seen)

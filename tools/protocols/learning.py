@@ -9,6 +9,7 @@ from matplotlib.axes import Axes
 
 from kiras_rl.config import ConfigError
 from kiras_rl.evaluation.flat import FLOOR, SkillResult
+from kiras_rl.schema import Config
 from kiras_rl.tools.curves import Series, read_scalars
 from kiras_rl.tools.protocols.rows import colours, panels
 from kiras_rl.tools.protocols.sampling import run_of
@@ -61,17 +62,14 @@ def measure(subject: Subject) -> dict:
             f"learning: the log of {run} holds no evaluation of skill learning: it is too young, "
             "began with --flat, or evaluation.interval=0 left them out"
         )
-    seconds = sum(np.array(log[tag][1]) for tag in TIMES)
-    share = config.num_envs * config.learner.ppo.num_steps  # of one rank
-    steps = share * round(np.median(seconds * log[SPEED][1]) / share)
-    minutes = np.interp(at, log[SPEED][0], np.cumsum(seconds) / 60)
+    steps, minutes = _pace(log, config, at)
     results = [_results(log, subject.skills, iteration) for iteration in at]
     return {
         "skills": len(subject.skills),
         "curves": [
             {
-                "steps": [iteration * steps / 1e6 for iteration in at],
-                "minutes": minutes.tolist(),
+                "steps": steps,
+                "minutes": minutes,
                 "at_floor": [sum(r.meets(**FLOOR) for r in skills) for skills in results],
                 "height_error": [100 * _mean(skills, "height_error") for skills in results],
                 "velocity_error": [_mean(skills, "velocity_error") for skills in results],
@@ -90,6 +88,15 @@ def _evaluated(log: Series, subject: Subject) -> list[int]:
     """Return the iterations of skill learning after which the policy was evaluated."""
     iterations, _ = log.get(f"Eval_{subject.skills[0]}/height", ([], []))
     return [iteration for iteration in iterations if iteration <= subject.run.iterations]
+
+
+def _pace(log: Series, config: Config, at: list[int]) -> tuple[list[float], list[float]]:
+    """Return the million steps of all ranks and the minutes that the iterations `at` took."""
+    seconds = sum(np.array(log[tag][1]) for tag in TIMES)
+    share = config.num_envs * config.learner.ppo.num_steps  # of one rank
+    steps = share * round(np.median(seconds * log[SPEED][1]) / share)
+    minutes = np.interp(at, log[SPEED][0], np.cumsum(seconds) / 60)
+    return [iteration * steps / 1e6 for iteration in at], minutes.tolist()
 
 
 def _results(log: Series, skills: tuple[str, ...], iteration: int) -> list[SkillResult]:

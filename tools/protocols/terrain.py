@@ -14,7 +14,7 @@ from kiras_rl.tools.report.content import Column, Figure, Section, Table
 TITLE = "Terrain"
 TEXT = (
     "Every skill crosses every rough terrain type at several levels of difficulty, 0 the lowest "
-    "and 10 the top, with the noise of the training: from the middle of a tile, with any heading, "
+    "and 10 the top, bumps included: from the middle of a tile, with any heading, "
     "which is held, at 0.2 to 0.6 m/s, 3 m far within twice the time of the way and 20 s, without "
     "a fall; strictly, if thighs and shanks touch the ground in at most 5 % of the steps."
 )
