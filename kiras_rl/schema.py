@@ -133,7 +133,6 @@ class DiscriminatorConfig:
     batch_size: int
     gradient_penalty: float
     noise: list[list[float]]
-    precision: str
 
 
 @dataclass
@@ -224,6 +223,7 @@ class PPOConfig:
 class LearnerConfig:
     """The learner; a null block removes that part of KiRAS."""
 
+    precision: str
     ppo: PPOConfig
     imitation: ImitationConfig | None
     multi_critic: MultiCriticConfig | None

@@ -27,7 +27,7 @@ ONE_STEP = (
     "learner.ppo.num_mini_batches=1",
     "learner.estimator.adaboot=off",
     "learner.imitation.discriminator.updates=1",
-    "learner.imitation.discriminator.precision=float32",  # gradients are compared to 1e-5
+    "learner.precision=float32",  # gradients are compared to 1e-5
     "learner.imitation.premium.keyframe_share=1",
 )
 

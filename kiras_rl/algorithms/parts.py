@@ -17,6 +17,7 @@ from kiras_rl.imitation.self_imitation import SelfImitation
 from kiras_rl.interfaces import SkillEnv
 from kiras_rl.models.critics import GroupCritic
 from kiras_rl.models.exported import ExportedPolicy
+from kiras_rl.models.precision import uses_bfloat16
 from kiras_rl.schema import LearnerConfig
 from kiras_rl.skills import SkillSampler
 
@@ -57,6 +58,7 @@ def build_parts(obs: TensorDict, env: SkillEnv, cfg: dict, device: str) -> Parts
     """
     config: LearnerConfig = cfg["learner"]
     ppo, retention = config.ppo, cfg["retention"]
+    half = uses_bfloat16(config.precision, device)
     estimation = Estimation.build(config.estimator, obs, env, device)
     if estimation:
         obs[names.CONTEXT] = estimation.context(obs)
@@ -64,7 +66,7 @@ def build_parts(obs: TensorDict, env: SkillEnv, cfg: dict, device: str) -> Parts
     if retention is not None:
         obs[names.FLAT_ACTION] = torch.zeros(len(obs), env.num_actions, device=device)
         obs[names.IS_FLAT] = torch.zeros(len(obs), 1, dtype=torch.bool, device=device)
-    imitation = SelfImitation.build(config.imitation, obs, env, ppo.num_steps, device)
+    imitation = SelfImitation.build(config.imitation, obs, env, ppo.num_steps, half, device)
     groups = {
         "actor": [names.PROPRIO, names.CONTEXT if estimation else names.HISTORY],
         "critic": [names.CRITIC],
@@ -79,7 +81,7 @@ def build_parts(obs: TensorDict, env: SkillEnv, cfg: dict, device: str) -> Parts
     if retention is not None:
         policy = ExportedPolicy(estimation.estimator if estimation else None, actor.mlp)
         reference = Reference(policy, retention, cfg["reward_scale"])
-    critic = GroupCritic(obs, groups, count, list(ppo.critic_dims)).to(device)
+    critic = GroupCritic(obs, groups, count, list(ppo.critic_dims), half).to(device)
     return Parts(actor, critic, storage, imitation, estimation, sampler, reference)
 
 

@@ -14,7 +14,7 @@ from kiras_rl.algorithms.losses import discriminator_loss, gradient_penalty
 from kiras_rl.algorithms.storage import GroupRolloutStorage
 from kiras_rl.imitation.premium import PremiumSelector
 from kiras_rl.interfaces import SkillEnv
-from kiras_rl.models.discriminator import Discriminator, imitation_reward, uses_bfloat16
+from kiras_rl.models.discriminator import Discriminator, imitation_reward
 from kiras_rl.recorded import Recorded
 from kiras_rl.schedules import piecewise_linear
 from kiras_rl.schema import ImitationConfig
@@ -35,6 +35,7 @@ class SelfImitation:
         skills: tuple[str, ...],
         num_envs: int,
         num_steps: int,
+        bfloat16: bool,
     ) -> None:
         """Build discriminator, optimizer, selector and the rollout's pairs.
 
@@ -47,6 +48,7 @@ class SelfImitation:
             skills: Names, for the log.
             num_envs: N.
             num_steps: T.
+            bfloat16: Multiply the hidden layers of the discriminator in it.
         """
         device = keyframe_features.device
         features = keyframe_features.shape[1]
@@ -56,9 +58,8 @@ class SelfImitation:
         self._noise = feature_noise.repeat(2)
         self._smooth = ~skill_code.repeat(2)
         self._noise_factor = torch.ones((), device=device)
-        half = uses_bfloat16(config.discriminator.precision, device)
         dims = config.discriminator.hidden_dims
-        self.discriminator = Discriminator(features, dims, bfloat16=half).to(device)
+        self.discriminator = Discriminator(features, dims, bfloat16).to(device)
         rate = config.discriminator.learning_rate
         self.optimizer = make_adam(self.discriminator.parameters(), rate, device)
         self.selector = PremiumSelector(config.premium, keyframe_features, num_envs, num_steps)
@@ -82,6 +83,7 @@ class SelfImitation:
         obs: TensorDict,
         env: SkillEnv,
         num_steps: int,
+        bfloat16: bool,
         device: str,
     ) -> SelfImitation | None:
         """Build for an environment, or return None where the configuration has no imitation."""
@@ -95,6 +97,7 @@ class SelfImitation:
             env.skills,
             len(obs),
             num_steps,
+            bfloat16,
         )
 
     def record(

@@ -7,6 +7,8 @@ from rsl_rl.models import MLPModel
 from tensordict import TensorDict
 from torch import nn
 
+from kiras_rl.models.precision import apply_layers
+
 
 class GroupCritic(nn.Module):
     """G independent value networks; group 0 is the task, group 1 imitation."""
@@ -19,16 +21,28 @@ class GroupCritic(nn.Module):
         obs_groups: dict[str, list[str]],
         num_groups: int,
         hidden_dims: list[int],
+        bfloat16: bool = False,
     ) -> None:
-        """Build G networks on the observation set "critic"."""
+        """Build G networks on the observation set "critic".
+
+        Args:
+            obs: An observation of the environment.
+            obs_groups: Which of its entries make a set.
+            num_groups: G.
+            hidden_dims: Widths.
+            bfloat16: Multiply the hidden layers in it.
+        """
         super().__init__()
+        self._bfloat16 = bfloat16
         self.critics = nn.ModuleList(
             MLPModel(obs, obs_groups, "critic", 1, hidden_dims, "elu") for _ in range(num_groups)
         )
 
     def forward(self, obs: TensorDict, **_: object) -> torch.Tensor:
         """Return the values of every group, (N, G)."""
-        return torch.cat([critic(obs) for critic in self.critics], dim=-1)
+        return torch.cat(
+            [apply_layers(c.mlp, c.get_latent(obs), self._bfloat16) for c in self.critics], dim=-1
+        )
 
     def reset(self, dones: torch.Tensor | None = None, hidden_state: object = None) -> None:
         """Do nothing: there is no memory."""

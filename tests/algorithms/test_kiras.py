@@ -8,7 +8,9 @@ import math
 import pytest
 import torch
 
+from kiras_rl import interfaces as names
 from kiras_rl.algorithms.kiras import IMITATION, TASK
+from kiras_rl.config import ConfigError
 from kiras_rl.phases import FINETUNING, SKILL_LEARNING
 
 PARTS = ("imitation", "multi_critic", "estimator", "skill_init")
@@ -184,6 +186,25 @@ def test_skills_are_drawn_by_their_task_values(make_runner):
     torch.testing.assert_close(
         runner.alg.skill_probabilities(keyframes), torch.tensor([1 - 2 / 8, 1 - 6 / 8])
     )
+
+
+def test_bfloat16_changes_values_by_its_rounding_alone(make_runner):
+    exact, rounded = (
+        make_runner(f"learner.precision={precision}").alg.critic
+        for precision in ("float32", "bfloat16")
+    )
+    rounded.load_state_dict(exact.state_dict())
+    for critic in (exact, rounded):  # what a critic learns: values of about 100
+        critic.critics[TASK].mlp[-1].bias.data.fill_(100.0)
+    obs = {names.CRITIC: torch.randn(500, 5)}
+    difference = (exact(obs) - rounded(obs)).abs()
+    assert rounded(obs).dtype == torch.float32
+    assert 0.0 < difference.max() < 0.02  # 100 itself would be rounded by up to 0.25
+
+
+def test_an_unknown_precision_is_refused(make_runner):
+    with pytest.raises(ConfigError, match="precision=half: allowed are auto, float32, bfloat16"):
+        make_runner("learner.precision=half")
 
 
 def test_a_saved_learner_goes_on(make_runner):
