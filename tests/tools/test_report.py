@@ -59,6 +59,15 @@ def test_a_terminal_shows_rounded_numbers_and_units_in_brackets_stay_text():
     assert "delay [ms]" in text and "[red]" in text and "0.13" in text
 
 
+def test_a_narrow_terminal_cuts_no_word():
+    columns = (Column("skill"), *(Column("clearance", "cm") for _ in range(6)))
+    rows = [(skill, *[0.5] * 6) for skill in ("pitch_up", "pitch_down")]
+    console = Console(width=60, record=True, file=io.StringIO())
+    console.print(as_rich(Table("t", columns, rows)))
+    text = console.export_text()
+    assert "pitch_up" in text and "pitch_down" in text and "…" not in text
+
+
 def test_the_page_needs_nothing_else(tmp_path):
     drawing = Drawing()
     drawing.subplots().plot([0, 1])

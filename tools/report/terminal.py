@@ -13,7 +13,9 @@ def as_rich(table: Table) -> RichTable:
     shown = RichTable(title=table.title, title_justify="left", caption=table.note or None)
     for i, column in enumerate(table.columns):
         heading = escape(f"{column.name}\n{column.unit}".rstrip())
-        shown.add_column(heading, justify="left" if table.is_words(i) else "right")
+        side = "left" if table.is_words(i) else "right"
+        # Narrow terminals cut words otherwise: pitch_up and pitch_down would look the same
+        shown.add_column(heading, justify=side, overflow="fold", no_wrap=i == 0)
     best = [table.best_rows(i) for i in range(len(table.columns))]
     for line, row in enumerate(table.rows):
         shown.add_row(
