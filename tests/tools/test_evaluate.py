@@ -50,6 +50,20 @@ def test_the_imitation_protocol_measures_the_shipped_policy(tmp_path, capsys):
         assert 1.0 < result["power"] < 15.0
 
 
+def test_both_backends_measure_the_same_walk(tmp_path):
+    skills = {}
+    for backend in ("native", "warp"):
+        command = ["--protocol", "imitation", "--robots", "1", "--nominal", "--backend", backend]
+        assert main([*command, "--out", str(tmp_path / backend)]) == 0
+        (imitation,) = results(tmp_path / backend, "imitation").values()
+        skills[backend] = imitation["skills"]
+    for skill in SKILLS:  # float64 and float32 motions part within a second, but not the gait
+        native, warp = skills["native"][skill], skills["warp"][skill]
+        assert warp["dtw_frame"] == pytest.approx(native["dtw_frame"], rel=0.05)
+        assert warp["frequency"] == pytest.approx(native["frequency"], abs=0.5)
+        assert warp["height_error"] == pytest.approx(native["height_error"], abs=0.001)
+
+
 def test_terrain_is_crossed_level_by_level_and_gives_the_same_numbers_again(
     tmp_path, capsys, monkeypatch
 ):
