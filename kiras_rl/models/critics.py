@@ -21,7 +21,7 @@ class GroupCritic(nn.Module):
         obs_groups: dict[str, list[str]],
         num_groups: int,
         hidden_dims: list[int],
-        bfloat16: bool = False,
+        bfloat16: bool,
     ) -> None:
         """Build G networks on the observation set "critic".
 

@@ -11,7 +11,7 @@ from kiras_rl.models.precision import apply_layers
 class Discriminator(nn.Module):
     """D(Phi_{t-1}, Phi_t): +1 for expert pairs, -1 for the policy's."""
 
-    def __init__(self, feature_dim: int, hidden_dims: list[int], bfloat16: bool = False) -> None:
+    def __init__(self, feature_dim: int, hidden_dims: list[int], bfloat16: bool) -> None:
         """Build an MLP from 2 * feature_dim to 1 with ReLU.
 
         Args:
