@@ -1,4 +1,4 @@
-"""Sweeps: several configurations and seeds, trained one after the other.
+"""Sweeps: several configurations and seeds, trained one after the other or side by side.
 
 What was done is read from the folders of the runs and kept nowhere else.
 """
@@ -95,20 +95,21 @@ def list_sweeps() -> list[str]:
     return sorted(path.stem for path in SWEEP_FOLDER.glob("*.yaml"))
 
 
-def load_sweep(name: str, overrides: list[str], runs: Path) -> list[Run]:
+def load_sweep(name: str, overrides: list[str], runs: Path, only: str | None = None) -> list[Run]:
     """Read a sweep and load all its configurations.
 
     Args:
         name: A file of cfg/sweeps/ without its ending, or a path.
         overrides: `key=value` strings for all runs, applied last.
         runs: Where runs are written.
+        only: Name of the one run that is wanted, label/seed_N; None for all of them.
 
     Returns:
         The runs in their order: all configurations of a seed, then those of the next.
 
     Raises:
         ConfigError: A file or configuration that cannot be used, or that is no longer the one with
-            which a run of this sweep was begun.
+            which a run of this sweep was begun, or a sweep without the run that is wanted.
     """
     path = _find(name)
     sweep = _read(path)
@@ -122,9 +123,18 @@ def load_sweep(name: str, overrides: list[str], runs: Path) -> list[Run]:
         for seed in sweep.seeds
         for label, config in configs.items()
     ]
+    if only is not None:
+        result = [_named(only, result)]
     for run in result:
         _check_unchanged(run)
     return result
+
+
+def _named(name: str, runs: list[Run]) -> Run:
+    for run in runs:
+        if run.name == name:
+            return run
+    raise ConfigError(f"--only {name}: this sweep has {', '.join(run.name for run in runs)}")
 
 
 def _find(name: str) -> Path:
@@ -293,13 +303,14 @@ def train_sweep(runs: list[Run]) -> Report:
     Raises:
         ConfigError: What a run could not use, before the first one trains.
     """
-    _try_out(runs)
+    try_out(runs)
     failures, done = set(), 0
     with StopRequest() as stop:
         for number, run in enumerate(runs, 1):
             if stop.requested:
                 break
-            console.print(f"[bold]run {number}/{len(runs)}[/] {run.name}", highlight=False)
+            if len(runs) > 1:
+                console.print(f"[bold]run {number}/{len(runs)}[/] {run.name}", highlight=False)
             try:
                 done += _train(run, stop)
             except MISTAKES as error:
@@ -308,7 +319,7 @@ def train_sweep(runs: list[Run]) -> Report:
     return Report(runs, failures, stop.requested and done + len(failures) < len(runs))
 
 
-def _try_out(runs: list[Run]) -> None:
+def try_out(runs: list[Run]) -> None:
     """Build each configuration once, with one world: what it refuses is refused now."""
     for label, config in {run.label: run.config for run in runs}.items():
         try:

@@ -17,6 +17,8 @@ from kiras_rl.checkpoint import FLAT, FOLDER, LATEST, find_checkpoint
 from kiras_rl.config import ConfigError, list_configs, load_config
 from kiras_rl.process import StopRequest
 from kiras_rl.runner import KirasRunner
+from kiras_rl.tools.arguments import at_least
+from kiras_rl.tools.side_by_side import train_side_by_side
 from kiras_rl.tools.sweep import list_sweeps, load_sweep, train_sweep
 from kiras_rl.tools.training import MISTAKES, begin, console, message_of, resume, train_run
 
@@ -31,7 +33,8 @@ policy.onnx and curves.png. Ctrl-C stops after the current iteration and saves; 
 exactly where it stopped.
 
 A sweep is a file of cfg/sweeps/ or your own: configurations and seeds, trained one after the other
-in runs/sweeps/<name>/<label>/seed_<n>/. The same command goes on where it was interrupted.
+in runs/sweeps/<name>/<label>/seed_<n>/; with --jobs several at a time, each on its share of the
+cores. The same command goes on where it was interrupted.
 """
 
 EXAMPLES = """\
@@ -43,6 +46,7 @@ examples:
   kiras-train --resume runs/solo8/2026-01-31_12-00-00
   kiras-train --cfg solo8 --flat runs/solo8/2026-01-31_12-00-00   its skills, finetuned anew
   kiras-train --sweep ablations                       KiRAS and its ablations, two seeds each
+  kiras-train --sweep ablations --jobs 2              two of them at a time
   kiras-train --sweep mine.yaml num_envs=512          your own sweep, a key set in all its runs
   torchrun --nproc-per-node 4 -m kiras_rl.tools.train --cfg solo8   on four GPUs
   tensorboard --logdir runs
@@ -86,6 +90,17 @@ def _parse(argv: list[str] | None) -> argparse.Namespace:
         help="with --cfg: run folder or checkpoint of an earlier skill learning; begin terrain "
         "finetuning with its best policy",
     )
+    parser.add_argument(
+        "--jobs",
+        type=at_least(1),
+        metavar="N",
+        help="with --sweep: runs that train at a time, at most one a core (default: 1)",
+    )
+    parser.add_argument(
+        "--only",
+        metavar="LABEL/seed_N",
+        help="with --sweep: train this run of it and no other, as one job of a cluster, say",
+    )
     parser.add_argument("--runs", type=Path, default=Path("runs"), help="where runs are written")
     parser.add_argument("overrides", nargs="*", metavar="key=value", help="keys to set")
     return parser.parse_intermixed_args(argv)
@@ -95,7 +110,11 @@ def _train(args: argparse.Namespace) -> int:
     console.quiet = not distributed.is_main()
     if distributed.is_main():
         logging.getLogger("kiras_rl").setLevel(logging.INFO)  # "kernels compile": minutes, once
-    return _train_sweep(args) if args.sweep else _train_one(args)
+    if args.sweep:
+        return _train_sweep(args)
+    if args.jobs or args.only:
+        raise ConfigError("--jobs and --only are about the runs of a sweep: give them with --sweep")
+    return _train_one(args)
 
 
 def _train_one(args: argparse.Namespace) -> int:
@@ -162,13 +181,25 @@ def _train_sweep(args: argparse.Namespace) -> int:
         raise ConfigError("--flat begins a new run: give it with --cfg, not with --sweep")
     if distributed.size() > 1:
         raise ConfigError("--sweep trains on one process: start it without torchrun")
-    report = train_sweep(load_sweep(args.sweep, args.overrides, args.runs))
-    console.print(report.table())
+    if args.only and args.jobs:
+        raise ConfigError("--only names one run, --jobs is for several: leave one of them out")
+    runs = load_sweep(args.sweep, args.overrides, args.runs, args.only)
+    command = _sweep_arguments(args)
+    report = train_side_by_side(runs, args.jobs, command) if args.jobs else train_sweep(runs)
+    if args.only is None:
+        console.print(report.table())
     if report.stopped:
-        where = [] if args.runs == Path("runs") else ["--runs", str(args.runs)]
-        command = shlex.join(["kiras-train", "--sweep", args.sweep, *where, *args.overrides])
-        _say(f"stopped and saved; go on with: {command}")
+        only = ["--only", args.only] if args.only else []
+        jobs = ["--jobs", str(args.jobs)] if args.jobs else []
+        again = shlex.join(["kiras-train", *command, *only, *jobs])
+        _say(f"stopped and saved; go on with: {again}")
     return 1 if report.failures else 0
+
+
+def _sweep_arguments(args: argparse.Namespace) -> list[str]:
+    """Return the arguments that name this sweep and its runs."""
+    where = [] if args.runs == Path("runs") else ["--runs", str(args.runs)]
+    return ["--sweep", args.sweep, *where, *args.overrides]
 
 
 def _say(message: str) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import logging
+import os
 
 import mujoco
 import numpy as np
@@ -41,7 +42,7 @@ class NativeSimulation:
             model: The scene with the sensors that the environment reads.
             num_worlds: N.
             substeps: Physics steps in a control step, K.
-            threads: Threads of the pool; 0 for one a core.
+            threads: Threads of the pool; 0 for one on each core that this process may use.
             terrain: The tiles that a world may show, if the scene has any.
         """
         self.model = model = copy.copy(model)
@@ -52,7 +53,8 @@ class NativeSimulation:
         self.num_worlds = num_worlds
         self.device = torch.device("cpu")
         self._substeps = substeps
-        self._batch = Batch(model, num_worlds, threads)
+        # MuJoCo itself would take all cores of the machine, also those that this process may not.
+        self._batch = Batch(model, num_worlds, threads or len(os.sched_getaffinity(0)))
         self._batch.reset(stage=int(mujoco.mjtStage.mjSTAGE_NONE))
         self._fields = {name: self._batch.expand(name) for name in RANDOMISED_FIELDS}
         self._bind_state()

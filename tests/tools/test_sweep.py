@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import itertools
+import os
 import shlex
 import signal
+import subprocess
+import sys
 
 import pytest
 import torch
@@ -12,6 +15,7 @@ import torch
 from kiras_rl.checkpoint import load_checkpoint
 from kiras_rl.config import list_configs, load_config
 from kiras_rl.tools.progress import Progress
+from kiras_rl.tools.side_by_side import core_shares
 from kiras_rl.tools.sweep import list_sweeps, load_sweep
 from kiras_rl.tools.train import main
 from kiras_rl.tools.training import begin
@@ -153,6 +157,67 @@ def test_a_sweep_compares_all_configurations_of_a_seed_first(tmp_path, capsys, i
         assert_same_bits(latest(sweep / f"kiras/seed_{seed}"), trained_alone(f"seed={seed}"))
     message = refusal(capsys, *command, "learner.skill_init=null")
     assert "was begun with learner.skill_init={...}, the sweep has null" in message
+
+
+# --- several at a time ---------------------------------------------------------------------------
+
+
+def test_jobs_train_what_each_run_would_have_trained_alone(tmp_path, capsys):
+    runs, jobs = tmp_path / "runs", min(2, len(os.sched_getaffinity(0)))
+    overrides = "[learner.estimator.learning_rate=1e30, learner.estimator.adaboot=off]"
+    configs = f"{{kiras: smoke, broken: {{cfg: smoke, overrides: {overrides}}}}}"
+    command = ["--sweep", write(tmp_path / "a.yaml", configs, "[1]"), "--runs", str(runs)]
+    before = os.sched_getaffinity(0)
+
+    assert main([*command, "--jobs", str(jobs)]) == 1
+    out = capsys.readouterr().out
+    assert rows(out) == [("kiras", "1", "2", "finished"), ("broken", "1", "-", "failed")]
+    assert "kiras/seed_1 | 2/2 | " in out and "go on with" not in out
+    assert_same_bits(latest(runs / "sweeps/tiny/kiras/seed_1"), trained_alone())
+    assert os.sched_getaffinity(0) == before
+
+    assert main([*command, "--only", "kiras/seed_1"]) == 0
+    out = capsys.readouterr().out
+    assert f"finished before: {runs}/sweeps/tiny/kiras/seed_1" in out
+    assert "broken" not in out
+
+
+def test_jobs_divide_the_cores_of_this_process(monkeypatch):
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: {7, 2, 3, 4, 5})
+    assert core_shares(1) == [{2, 3, 4, 5, 7}]
+    assert core_shares(2) == [{2, 3}, {4, 5, 7}]
+    assert core_shares(5) == [{2}, {3}, {4}, {5}, {7}]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_stopped_jobs_save(number, tmp_path):
+    jobs = str(min(2, len(os.sched_getaffinity(0))))
+    overrides = ["num_envs=4", "iterations=100000", "finetuning=null", "evaluation.interval=0"]
+    file = write(tmp_path / "a.yaml", "[smoke]", "[1, 2, 3]", [*overrides, "checkpoint_minutes=99"])
+    command = ["--sweep", file, "--runs", str(tmp_path), "--jobs", jobs]
+    process = subprocess.Popen(
+        [sys.executable, "-m", "kiras_rl.tools.train", *command], cwd=tmp_path, text=True,
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+    )  # fmt: skip
+    try:
+        started = set()
+        for line in process.stdout:
+            if "/100000 |" in line:  # an iteration is done
+                started.add(line.split()[0])
+            if len(started) == int(jobs):
+                break
+        process.send_signal(number)
+        out, err = process.communicate(timeout=120)
+    finally:
+        process.kill()
+    assert (process.returncode, err) == (0, "")
+    last = out.splitlines()[-1]
+    assert last == f"stopped and saved; go on with: kiras-train {shlex.join(command)}"
+    status = [row[3] for row in rows(out)]
+    assert status == int(jobs) * ["interrupted"] + (3 - int(jobs)) * ["not begun"]
+    for name in started:
+        assert latest(tmp_path / "sweeps/tiny" / name)["iteration"] >= 1
 
 
 # --- what cannot be ------------------------------------------------------------------------------
