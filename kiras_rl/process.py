@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import signal
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 
 import torch
 
@@ -38,22 +39,20 @@ class StopRequest:
             signal.signal(number, handler)
 
 
-class single_threaded:  # noqa: N801  (used like a function)
-    """Keeps torch to one thread on a CPU: OpenMP's waiting threads would starve the physics."""
+@contextmanager
+def threads_of_torch(count: int) -> Iterator[None]:
+    """Let torch's operations take so many threads, and as many as before afterwards."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(count)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
 
-    def __init__(self, device: str) -> None:
-        """Do nothing on a GPU."""
-        self._threads = torch.get_num_threads() if torch.device(device).type == "cpu" else None
 
-    def __enter__(self) -> None:
-        """Leave one thread."""
-        if self._threads is not None:
-            torch.set_num_threads(1)
-
-    def __exit__(self, *_: object) -> None:
-        """Give the threads back."""
-        if self._threads is not None:
-            torch.set_num_threads(self._threads)
+def single_threaded(device: torch.device | str) -> AbstractContextManager[None]:
+    """Keep torch to one thread on a CPU: OpenMP's waiting threads would starve the physics."""
+    return threads_of_torch(1) if torch.device(device).type == "cpu" else nullcontext()
 
 
 def generator_states() -> dict[str, torch.Tensor]:

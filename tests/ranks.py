@@ -110,6 +110,7 @@ def drawn_alike():
     return patch.multiple(
         torch,
         rand=lambda *size, device=None: torch.full(size, 0.5),
+        randn=lambda *size, device=None: torch.zeros(size),
         randn_like=torch.zeros_like,
         randint=lambda high, size, device=None: torch.arange(high),
     )

@@ -9,15 +9,16 @@ from tensordict import TensorDict
 
 from kiras_rl import distributed
 from kiras_rl import interfaces as names
+from kiras_rl.algorithms import losses
 from kiras_rl.algorithms.adaboot import MODES, AdaBoot
 from kiras_rl.algorithms.adam import load_adam, make_adam
-from kiras_rl.algorithms.losses import gaussian_kl, masked_mse
 from kiras_rl.algorithms.storage import GroupRolloutStorage, mini_batches
 from kiras_rl.config import ConfigError
 from kiras_rl.interfaces import SkillEnv
 from kiras_rl.models.estimator import VELOCITY_DIM, ContextEstimator
 from kiras_rl.recorded import Recorded
 from kiras_rl.schema import EstimatorConfig
+from kiras_rl.shards import differentiate
 
 VELOCITY_SCALE = 2.0  # in the loss: velocity errors then weigh as much as observation errors
 
@@ -130,15 +131,21 @@ class Estimation:
         return torch.stack([self._train_step(batch) for batch in batches]).sum(0)
 
     def _train_step(self, batch: dict[str, torch.Tensor]) -> torch.Tensor:
+        """Take one gradient step; return `_losses`, (4,)."""
+        noise = torch.randn(len(batch["skill"]), self.config.latent_dim, device=self._device)
+        goes_on = losses.weights_of(batch["goes_on"].squeeze(-1))  # an end has no next frame
+        parameters = list(self.estimator.parameters())
+        parts = differentiate(self._loss, batch | {"noise": noise, "goes_on": goes_on}, parameters)
+        distributed.average_gradients(parameters)
+        self.optimizer.step()
+        return parts
+
+    def _loss(self, **batch: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         parts = self._losses(**batch)
         velocity, prediction, kl, prior = parts
         loss = velocity * VELOCITY_SCALE**2 + prediction
         loss = loss + self.config.kl_weight * kl + self.config.prior_weight * prior
-        self.optimizer.zero_grad()
-        loss.backward()
-        distributed.average_gradients(self.estimator.parameters())
-        self.optimizer.step()
-        return torch.stack(parts).detach()
+        return loss, torch.stack(parts)
 
     def _losses(
         self,
@@ -147,18 +154,18 @@ class Estimation:
         target: torch.Tensor,
         skill: torch.Tensor,
         goes_on: torch.Tensor,
+        noise: torch.Tensor,
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
         """Return errors of velocity ((m/s)^2) and prediction, KL to the prior, KL of the prior."""
         estimate, mean, log_var = self.estimator(history)
-        latent = mean + torch.randn_like(mean) * torch.exp(0.5 * log_var)
-        prediction = self.estimator.decode(latent, skill)
+        prediction = self.estimator.decode(mean + noise * torch.exp(0.5 * log_var), skill)
         prior_mean, prior_log_var = self.estimator.prior_of(skill)
         zero = torch.zeros_like(prior_mean)
         return (
             (estimate - velocity).square().mean(),
-            masked_mse(prediction, target, goes_on.squeeze(-1)),  # an end has no next frame
-            gaussian_kl(mean, log_var, prior_mean, prior_log_var).mean(),
-            gaussian_kl(prior_mean, prior_log_var, zero, zero).mean(),
+            losses.weighted_mse(prediction, target, goes_on),
+            losses.gaussian_kl(mean, log_var, prior_mean, prior_log_var).mean(),
+            losses.gaussian_kl(prior_mean, prior_log_var, zero, zero).mean(),
         )
 
     def state_dict(self) -> dict:

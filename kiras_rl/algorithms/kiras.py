@@ -29,6 +29,7 @@ from kiras_rl.models.exported import ExportedPolicy
 from kiras_rl.recorded import Recorded
 from kiras_rl.schedules import advantage_weights, piecewise_linear
 from kiras_rl.schema import LearnerConfig
+from kiras_rl.shards import apply, differentiate
 
 TASK, IMITATION = 0, 1  # reward groups
 
@@ -121,14 +122,20 @@ class KirasPPO(PPO):
             obs: Observation after the last step.
         """
         st = self.storage
-        st.values = self.critic(st.observations)
+        st.values = self._values(st.observations[names.CRITIC])
         # rsl-rl's convention: an episode cut by the clock goes on with the value where it began
         st.rewards = self._group_rewards() + self.gamma * st.values * st.time_outs
         advantages = returns.generalized_advantages(
-            st.rewards, st.values, self.critic(obs), st.dones, self.gamma, self.lam
+            st.rewards, st.values, self._values(obs[names.CRITIC]), st.dones, self.gamma, self.lam
         )
         st.returns = advantages + st.values
         st.advantages = returns.mix_advantages(advantages, self._weights(), self._std_floor())
+
+    def _values(self, observations: torch.Tensor) -> torch.Tensor:
+        """Return the values of critic observations (..., C) in every group, (..., G)."""
+        flat = {names.CRITIC: observations.flatten(0, -2)}
+        values = apply(lambda **batch: self.critic(batch), flat)
+        return values.unflatten(0, observations.shape[:-1])
 
     def _group_rewards(self) -> torch.Tensor:
         """Return task and imitation rewards, (T, N, G); summed where there is one critic."""
@@ -190,7 +197,7 @@ class KirasPPO(PPO):
             "Loss/value": value,
             "Policy/kl": kl,
             "Policy/learning_rate": self.learning_rate.item(),
-            "Policy/action_std": self.actor.output_std.mean().item(),
+            "Policy/action_std": self.actor.distribution.std_param.mean().item(),
         }
 
     def _train_epoch(self) -> torch.Tensor:
@@ -201,35 +208,50 @@ class KirasPPO(PPO):
 
     def _policy_step(self, batch: dict[str, torch.Tensor]) -> torch.Tensor:
         """Take one gradient step; return (surrogate, value, KL), (3,)."""
-        distribution = self.actor.distribution
-        distribution.update(self.actor.mlp(batch["actor_obs"]))
-        log_prob = distribution.log_prob(batch["actions"])
-        kl = self._adapt_to_kl((batch["mean"], batch["std"]))
-        values = self.critic({names.CRITIC: batch["critic_obs"]})
-        surrogate = losses.surrogate_loss(
-            log_prob, batch["old_log_prob"].squeeze(1), batch["advantages"].squeeze(1),
-            self.clip_param,
-        )  # fmt: skip
-        value = losses.value_loss(values, batch["returns"])
-        loss = surrogate + self.value_loss_coef * value
         if self.reference:
-            loss = loss + self.reference.loss_weight * losses.retention_loss(
-                distribution.mean, batch[names.FLAT_ACTION], batch[names.IS_FLAT].squeeze(1)
-            )
-        self.optimizer.zero_grad()
-        loss.backward()
-        distributed.average_gradients(chain(self.actor.parameters(), self.critic.parameters()))
+            batch = batch | {names.IS_FLAT: losses.weights_of(batch[names.IS_FLAT].squeeze(1))}
+        parameters = [*self.actor.mlp.parameters(), *self.critic.parameters()]
+        numbers = differentiate(self._policy_loss, batch, parameters)
+        numbers[2] = self._adapt_to_kl(numbers[2])
+        distributed.average_gradients(parameters)
         for network in (self.actor, *self.critic.critics):
             nn.utils.clip_grad_norm_(network.parameters(), self.max_grad_norm)
         self.optimizer.step()
-        distribution.update(distribution.mean.detach())  # keeps nothing of this step alive
-        return torch.stack([surrogate, value, kl]).detach()
+        return numbers
 
-    @torch.no_grad()
-    def _adapt_to_kl(self, old_params: tuple[torch.Tensor, ...]) -> torch.Tensor:
-        """Adapt the learning rate to the mean KL divergence from the rollout's policy."""
-        distribution = self.actor.distribution
-        kl = distributed.mean(distribution.kl_divergence(old_params, distribution.params).mean())
+    def _policy_loss(
+        self,
+        actor_obs: torch.Tensor,
+        critic_obs: torch.Tensor,
+        actions: torch.Tensor,
+        old_log_prob: torch.Tensor,
+        advantages: torch.Tensor,
+        returns: torch.Tensor,
+        mean: torch.Tensor,
+        std: torch.Tensor,
+        flat_action: torch.Tensor | None = None,
+        is_flat: torch.Tensor | None = None,
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return the loss on rows of the rollout and (surrogate, value, KL), (3,)."""
+        distribution = copy.copy(self.actor.distribution)  # it remembers what it was updated with
+        distribution.update(self.actor.mlp(actor_obs))
+        surrogate = losses.surrogate_loss(
+            distribution.log_prob(actions), old_log_prob.squeeze(1), advantages.squeeze(1),
+            self.clip_param,
+        )  # fmt: skip
+        value = losses.value_loss(self.critic({names.CRITIC: critic_obs}), returns)
+        loss = surrogate + self.value_loss_coef * value
+        if self.reference and flat_action is not None and is_flat is not None:
+            loss = loss + self.reference.loss_weight * losses.retention_loss(
+                distribution.mean, flat_action, is_flat
+            )
+        with torch.no_grad():
+            kl = distribution.kl_divergence((mean, std), distribution.params).mean()
+        return loss, torch.stack([surrogate, value, kl])
+
+    def _adapt_to_kl(self, kl: torch.Tensor) -> torch.Tensor:
+        """Adapt the learning rate to this rank's mean KL divergence; return that of all ranks."""
+        kl = distributed.mean(kl)
         limits = self.config.ppo.learning_rate_range
         adapted = losses.adapt_learning_rate(self.learning_rate, kl, self.desired_kl, limits)
         self.learning_rate.copy_(adapted)  # in place: the optimizer reads this tensor

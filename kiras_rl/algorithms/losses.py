@@ -26,19 +26,28 @@ def value_loss(values: torch.Tensor, returns: torch.Tensor) -> torch.Tensor:
     return (values - returns).square().mean(dim=0).sum()
 
 
+def weights_of(mask: torch.Tensor) -> torch.Tensor:
+    """Return weights, (B,), with which a mean over the batch is one over the rows of a mask, (B,).
+
+    Over those of all ranks: they differ in how many rows count, and the mean of their gradients has
+    to be the gradient of the mean over all. Zero where no row of any rank counts.
+    """
+    weight = mask.float()
+    counted = distributed.mean(weight.sum()).clamp(min=1.0 / distributed.size())
+    return weight * (len(weight) / counted)
+
+
 def retention_loss(
-    mean: torch.Tensor, flat_action: torch.Tensor, is_flat: torch.Tensor
+    mean: torch.Tensor, flat_action: torch.Tensor, weight: torch.Tensor
 ) -> torch.Tensor:
     """Return E |mu - a_flat|^2 over the steps on flat ground; 0 where there are none.
 
     Args:
         mean: Mean actions, (B, J).
         flat_action: Actions of the frozen flat policy, (B, J).
-        is_flat: Steps on flat ground, (B,) bool.
+        weight: `weights_of` the steps on flat ground, (B,).
     """
-    weight = is_flat.float()
-    squared = (mean - flat_action).square().sum(-1)
-    return (squared * weight).sum() / _count(weight)
+    return ((mean - flat_action).square().sum(-1) * weight).mean()
 
 
 def adapt_learning_rate(
@@ -58,36 +67,32 @@ def adapt_learning_rate(
 
 
 def discriminator_loss(
-    expert: torch.Tensor, policy: torch.Tensor, valid: torch.Tensor
+    expert: torch.Tensor, policy: torch.Tensor, weight: torch.Tensor
 ) -> torch.Tensor:
     """Return the LSGAN loss E[(D - 1)^2] on experts + E[(D + 1)^2] on the policy.
 
     Args:
         expert: Scores of expert pairs, (B,).
         policy: Scores of the policy's pairs, (B,).
-        valid: Which of the policy's pairs count, (B,) bool.
+        weight: `weights_of` those of the policy's pairs that count, (B,).
     """
-    weight = valid.float()
-    policy_part = ((policy + 1.0).square() * weight).sum() / _count(weight)
-    return (expert - 1.0).square().mean() + policy_part
+    return ((expert - 1.0).square() + weight * (policy + 1.0).square()).mean()
 
 
 def gradient_penalty(
-    discriminator: nn.Module, expert: torch.Tensor, policy: torch.Tensor, features: torch.Tensor
+    discriminator: nn.Module, points: torch.Tensor, features: torch.Tensor
 ) -> torch.Tensor:
-    """Return E |dD/dx|^2 on random points between expert and policy pairs of the same skill.
+    """Return E |dD/dx|^2.
 
-    It makes D change steadily from the one to the other, so that a motion far from its keyframe
-    still learns in which direction the keyframe lies.
+    On points between expert and policy it makes D change steadily from the one to the other, so
+    that a motion far from its keyframe still learns in which direction the keyframe lies.
 
     Args:
         discriminator: (B, 2 D) -> (B,).
-        expert: Expert pairs, (B, 2 D).
-        policy: Pairs of the policy, (B, 2 D).
+        points: Pairs, (B, 2 D).
         features: Inputs that count, (2 D,) bool; the code of the skill does not.
     """
-    blend = torch.rand(len(expert), 1, device=expert.device)
-    points = (blend * expert + (1.0 - blend) * policy).requires_grad_()
+    points = points.detach().requires_grad_()
     scores = discriminator(points)
     (gradient,) = torch.autograd.grad(scores.sum(), points, create_graph=True)
     return (gradient * features).square().sum(-1).mean()
@@ -102,17 +107,8 @@ def gaussian_kl(
     return 0.5 * (prior_log_var - log_var + var_ratio + shift - 1.0).sum(-1)
 
 
-def masked_mse(prediction: torch.Tensor, target: torch.Tensor, mask: torch.Tensor) -> torch.Tensor:
-    """Return the mean squared error over the rows (N, k) that the mask (N,) keeps."""
-    weight = mask.float().unsqueeze(-1)
-    count = _count(weight) * prediction.shape[-1]
-    return ((prediction - target).square() * weight).sum() / count
-
-
-def _count(weight: torch.Tensor) -> torch.Tensor:
-    """Return the mean over the ranks of how many samples count; more than 0.
-
-    A sum over this rank's samples, divided by it, has gradients whose mean over the ranks is the
-    gradient of the mean over the samples of all: the ranks differ in how many of theirs count.
-    """
-    return distributed.total(weight.sum()).clamp(min=1.0) / distributed.size()
+def weighted_mse(
+    prediction: torch.Tensor, target: torch.Tensor, weight: torch.Tensor
+) -> torch.Tensor:
+    """Return the mean squared error of rows (N, k), each with its weight (N,)."""
+    return ((prediction - target).square() * weight.unsqueeze(-1)).mean()

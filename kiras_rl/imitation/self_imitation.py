@@ -10,7 +10,7 @@ from tensordict import TensorDict
 from kiras_rl import distributed
 from kiras_rl import interfaces as names
 from kiras_rl.algorithms.adam import load_adam, make_adam
-from kiras_rl.algorithms.losses import discriminator_loss, gradient_penalty
+from kiras_rl.algorithms.losses import discriminator_loss, gradient_penalty, weights_of
 from kiras_rl.algorithms.storage import GroupRolloutStorage
 from kiras_rl.imitation.premium import PremiumSelector
 from kiras_rl.interfaces import SkillEnv
@@ -18,6 +18,7 @@ from kiras_rl.models.discriminator import Discriminator, imitation_reward
 from kiras_rl.recorded import Recorded
 from kiras_rl.schedules import piecewise_linear
 from kiras_rl.schema import ImitationConfig
+from kiras_rl.shards import apply, differentiate
 
 
 class SelfImitation:
@@ -139,7 +140,8 @@ class SelfImitation:
     @torch.no_grad()
     def rewards(self) -> torch.Tensor:
         """Return the imitation reward of every step of the rollout, (T, N)."""
-        score = self.discriminator(self._pairs)
+        score = apply(lambda pairs: self.discriminator(pairs), {"pairs": self._pairs.flatten(0, 1)})
+        score = score.view_as(self._valid)
         self._rewards = self.config.reward_weight * imitation_reward(score) * self._valid
         return self._rewards
 
@@ -153,37 +155,59 @@ class SelfImitation:
         self._skill = one_hot.flatten(0, 1).argmax(dim=-1)
         self._noise_factor.fill_(piecewise_linear(self.config.discriminator.noise, progress))
         for _ in range(self.config.discriminator.updates):
-            loss, expert, policy = self._train()
+            numbers = self._train()
+        loss, expert, policy = numbers.tolist()
         scalars |= {
-            "Discriminator/loss": loss.item(),
-            "Discriminator/expert": expert.mean().item(),
-            "Discriminator/policy": policy.mean().item(),
+            "Discriminator/loss": loss,
+            "Discriminator/expert": expert,
+            "Discriminator/policy": policy,
         }
         return scalars | self._describe_buffer(iteration)
 
-    def _train_step(self) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Take one step on a batch; experts show the same skills as the policy's pairs.
+    def _train_step(self) -> torch.Tensor:
+        """Take one step on a batch; return loss and mean scores of experts and policy, (3,).
 
-        Other proportions would reward a skill for being frequent: its code is an input.
+        Experts show the same skills as the policy's pairs: other proportions would reward a skill
+        for being frequent, as its code is an input.
         """
         pairs, valid = self._pairs.flatten(0, 1), self._valid.flatten()
         size = self.config.discriminator.batch_size
         drawn = torch.randint(len(pairs), (size,), device=pairs.device)
-        expert = self.selector.sample(self._skill[drawn])
-        both = torch.cat([expert, pairs[drawn]])
-        both = both + self._noise_factor * self._noise * torch.randn_like(both)
-        expert_score, policy_score = self.discriminator(both).chunk(2)
-        loss = discriminator_loss(expert_score, policy_score, valid[drawn])
-        weight = self.config.discriminator.gradient_penalty
-        if weight > 0:
-            loss = loss + weight * gradient_penalty(
-                self.discriminator, *both.chunk(2), features=self._smooth
-            )
-        self.optimizer.zero_grad()
-        loss.backward()
-        distributed.average_gradients(self.discriminator.parameters())
+        expert = self._with_noise(self.selector.sample(self._skill[drawn]))
+        policy = self._with_noise(pairs[drawn])
+        blend = torch.rand(size, 1, device=pairs.device)
+        batch = {"expert": expert, "policy": policy, "weight": weights_of(valid[drawn])}
+        batch["between"] = blend * expert + (1.0 - blend) * policy
+        parameters = list(self.discriminator.parameters())
+        numbers = differentiate(self._loss, batch, parameters)
+        distributed.average_gradients(parameters)
         self.optimizer.step()
-        return loss.detach(), expert_score.detach(), policy_score.detach()
+        return numbers
+
+    def _with_noise(self, pairs: torch.Tensor) -> torch.Tensor:
+        return pairs + self._noise_factor * self._noise * torch.randn_like(pairs)
+
+    def _loss(
+        self,
+        expert: torch.Tensor,
+        policy: torch.Tensor,
+        weight: torch.Tensor,
+        between: torch.Tensor,
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return the loss on pairs (B, 2 D), and (loss, mean scores of experts, of policy), (3,).
+
+        Args:
+            expert: Pairs of experts.
+            policy: Pairs of the policy.
+            weight: Of the latter, (B,).
+            between: Random points on the way from the one to the other.
+        """
+        expert_score, policy_score = self.discriminator(torch.cat([expert, policy])).chunk(2)
+        loss = discriminator_loss(expert_score, policy_score, weight)
+        steepness = self.config.discriminator.gradient_penalty
+        if steepness > 0:
+            loss = loss + steepness * gradient_penalty(self.discriminator, between, self._smooth)
+        return loss, torch.stack([loss, expert_score.mean(), policy_score.mean()])
 
     def _describe(self, one_hot: torch.Tensor) -> dict[str, float]:
         """Return the mean imitation reward of each skill over the rollout."""

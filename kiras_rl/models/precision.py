@@ -41,7 +41,8 @@ def apply_layers(layers: nn.Sequential, x: torch.Tensor, bfloat16: bool) -> torc
         bfloat16: Multiply the hidden layers in it.
     """
     *hidden, output = layers
-    with torch.autocast(x.device.type, torch.bfloat16, enabled=bfloat16):
+    # Without its cache of rounded weights, which threads would share: each is used once anyway
+    with torch.autocast(x.device.type, torch.bfloat16, enabled=bfloat16, cache_enabled=False):
         for layer in hidden:
             x = layer(x)
     return output(x.float())

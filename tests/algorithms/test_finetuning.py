@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from kiras_rl.algorithms.kiras import TASK
-from kiras_rl.algorithms.losses import retention_loss
+from kiras_rl.algorithms.losses import retention_loss, weights_of
 from kiras_rl.algorithms.residual import Reference
 from kiras_rl.phases import FINETUNING
 from kiras_rl.schema import RetentionConfig
@@ -79,8 +79,9 @@ def test_the_residual_reward_is_the_distance_of_what_was_done(make_runner):
 def test_the_loss_is_the_squared_distance_on_flat_ground():
     mean = torch.tensor([[0.3, -0.4], [1.0, 1.0], [0.0, 2.0]])
     flat = torch.tensor([True, False, True])
-    assert retention_loss(mean, torch.zeros(3, 2), flat) == pytest.approx((0.25 + 4.0) / 2)
-    assert retention_loss(mean, torch.zeros(3, 2), ~flat & flat) == 0.0
+    weight, none = weights_of(flat), weights_of(flat & ~flat)
+    assert retention_loss(mean, torch.zeros(3, 2), weight) == pytest.approx((0.25 + 4.0) / 2)
+    assert retention_loss(mean, torch.zeros(3, 2), none) == 0.0
 
 
 def test_on_flat_ground_the_policy_is_pulled_back(make_runner):

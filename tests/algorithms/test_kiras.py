@@ -115,7 +115,7 @@ def test_no_pair_of_features_straddles_a_reset(make_runner):
     )
     collect(runner)
     hook.remove()
-    before, after = torch.cat(pairs).flatten(0, 1).chunk(2, dim=1)
+    before, after = torch.cat(pairs).chunk(2, dim=1)
     assert after[:, 0].max() > 0  # some episodes did end
     assert torch.equal(before[:, 0], after[:, 0])  # the episode
     assert torch.equal(before[:, 1] + 1, after[:, 1])  # the step in it

@@ -13,9 +13,10 @@ from kiras_rl.algorithms.losses import (
     discriminator_loss,
     gaussian_kl,
     gradient_penalty,
-    masked_mse,
     surrogate_loss,
     value_loss,
+    weighted_mse,
+    weights_of,
 )
 
 
@@ -60,13 +61,13 @@ def test_the_learning_rate_follows_the_divergence_within_limits(rate, kl, expect
 
 
 def test_the_discriminator_is_pulled_to_plus_and_minus_one():
-    expert, policy = torch.tensor([1.0, 0.0]), torch.tensor([-1.0, 2.0, 100.0])
-    loss = discriminator_loss(expert, policy, torch.tensor([True, True, False]))
-    assert loss.item() == (0 + 1) / 2 + (0 + 9) / 2
+    expert, policy = torch.tensor([1.0, 0.0, 2.0]), torch.tensor([-1.0, 2.0, 100.0])
+    loss = discriminator_loss(expert, policy, weights_of(torch.tensor([True, True, False])))
+    assert loss.item() == pytest.approx((0 + 1 + 1) / 3 + (0 + 9) / 2)
 
 
 def test_without_a_valid_pair_only_experts_count():
-    loss = discriminator_loss(torch.zeros(2), torch.full((2,), 9.0), torch.zeros(2).bool())
+    loss = discriminator_loss(torch.zeros(2), torch.full((2,), 9.0), weights_of(torch.zeros(2)))
     assert loss.item() == 1.0
 
 
@@ -74,9 +75,8 @@ def test_the_gradient_penalty_is_the_squared_slope_in_the_features_that_count():
     line = torch.nn.Linear(3, 1)
     line.weight.data = torch.tensor([[1.0, 2.0, 3.0]])
     penalty = gradient_penalty(
-        lambda x: line(x).squeeze(1), torch.randn(5, 3), torch.randn(5, 3),
-        features=torch.tensor([True, True, False]),
-    )  # fmt: skip
+        lambda x: line(x).squeeze(1), torch.randn(5, 3), torch.tensor([True, True, False])
+    )
     assert penalty.item() == 1.0 + 4.0
 
 
@@ -89,5 +89,6 @@ def test_the_divergence_of_gaussians_is_that_of_torch():
 
 def test_rows_outside_the_mask_do_not_count():
     prediction, target = torch.tensor([[1.0, 2.0], [9.0, 9.0]]), torch.zeros(2, 2)
-    assert masked_mse(prediction, target, torch.tensor([True, False])).item() == (1 + 4) / 2
-    assert masked_mse(prediction, target, torch.tensor([False, False])).item() == 0.0
+    some, none = weights_of(torch.tensor([True, False])), weights_of(torch.zeros(2).bool())
+    assert weighted_mse(prediction, target, some).item() == (1 + 4) / 2
+    assert weighted_mse(prediction, target, none).item() == 0.0

@@ -135,7 +135,7 @@ def test_steps_that_do_not_count_earn_and_teach_nothing(make_imitation):
 def test_what_has_no_noise_is_smooth_as_well(make_imitation, monkeypatch):
     seen = []
 
-    def spy(discriminator, expert, policy, features):
+    def spy(discriminator, points, features):
         seen.append(features.tolist())
         return torch.zeros(())
 

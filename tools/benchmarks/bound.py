@@ -21,6 +21,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils.flop_counter import flop_registry
 
 from kiras_rl.phases import SKILL_LEARNING
+from kiras_rl.process import single_threaded
 from kiras_rl.schema import LearnerConfig
 from kiras_rl.tools.benchmarks.request import Figures, Request, native
 from kiras_rl.tools.benchmarks.tables import make_table, verdict, with_range
@@ -132,7 +133,8 @@ def count_operations(training: Training) -> dict[str, int]:
         if owner is not None:
             setattr(owner, method, _counted(getattr(owner, method), network, counts))
             wrapped.append((owner, method))
-    training.iterate()
+    with single_threaded("cpu"):  # the counter sees one thread
+        training.iterate()
     for owner, method in wrapped:
         delattr(owner, method)
     return counts
