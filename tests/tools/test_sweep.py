@@ -317,9 +317,9 @@ def test_both_phases_of_the_ablations_have_one_budget(tmp_path):
 
 def test_the_sweep_of_efficiency_uses_the_same_steps_in_other_ways(tmp_path):
     runs = load_sweep("efficiency", [], tmp_path)
-    assert len(runs) == 3
+    assert len(runs) == 2 * 5
     for run in runs:
         config = run.config
-        assert config.num_envs * config.learner.ppo.num_steps * config.iterations == 6_881_280
-    learners = [run.config.learner for run in runs]
+        assert config.num_envs * config.learner.ppo.num_steps * config.iterations == 9_830_400
+    learners = [run.config.learner for run in runs[:5]]
     assert all(learners.count(learner) == 1 for learner in learners)
