@@ -133,9 +133,10 @@ class Estimation:
     def _train_step(self, batch: dict[str, torch.Tensor]) -> torch.Tensor:
         """Take one gradient step; return `_losses`, (4,)."""
         noise = torch.randn(len(batch["skill"]), self.config.latent_dim, device=self._device)
-        goes_on = losses.weights_of(batch["goes_on"].squeeze(-1))  # an end has no next frame
+        goes_on = batch.pop("goes_on").squeeze(-1)  # an end has no next frame
+        extra = {"noise": noise, "target_weight": losses.weights_of(goes_on)}
         parameters = list(self.estimator.parameters())
-        parts = differentiate(self._loss, batch | {"noise": noise, "goes_on": goes_on}, parameters)
+        parts = differentiate(self._loss, batch | extra, parameters)
         distributed.average_gradients(parameters)
         self.optimizer.step()
         return parts
@@ -153,8 +154,8 @@ class Estimation:
         velocity: torch.Tensor,
         target: torch.Tensor,
         skill: torch.Tensor,
-        goes_on: torch.Tensor,
         noise: torch.Tensor,
+        target_weight: torch.Tensor,
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
         """Return errors of velocity ((m/s)^2) and prediction, KL to the prior, KL of the prior."""
         estimate, mean, log_var = self.estimator(history)
@@ -163,7 +164,7 @@ class Estimation:
         zero = torch.zeros_like(prior_mean)
         return (
             (estimate - velocity).square().mean(),
-            losses.weighted_mse(prediction, target, goes_on),
+            losses.weighted_mse(prediction, target, target_weight),
             losses.gaussian_kl(mean, log_var, prior_mean, prior_log_var).mean(),
             losses.gaussian_kl(prior_mean, prior_log_var, zero, zero).mean(),
         )

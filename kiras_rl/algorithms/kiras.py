@@ -209,7 +209,7 @@ class KirasPPO(PPO):
     def _policy_step(self, batch: dict[str, torch.Tensor]) -> torch.Tensor:
         """Take one gradient step; return (surrogate, value, KL), (3,)."""
         if self.reference:
-            batch = batch | {names.IS_FLAT: losses.weights_of(batch[names.IS_FLAT].squeeze(1))}
+            batch["flat_weight"] = losses.weights_of(batch.pop(names.IS_FLAT).squeeze(1))
         parameters = [*self.actor.mlp.parameters(), *self.critic.parameters()]
         numbers = differentiate(self._policy_loss, batch, parameters)
         numbers[2] = self._adapt_to_kl(numbers[2])
@@ -230,7 +230,7 @@ class KirasPPO(PPO):
         mean: torch.Tensor,
         std: torch.Tensor,
         flat_action: torch.Tensor | None = None,
-        is_flat: torch.Tensor | None = None,
+        flat_weight: torch.Tensor | None = None,
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """Return the loss on rows of the rollout and (surrogate, value, KL), (3,)."""
         distribution = copy.copy(self.actor.distribution)  # it remembers what it was updated with
@@ -241,9 +241,9 @@ class KirasPPO(PPO):
         )  # fmt: skip
         value = losses.value_loss(self.critic({names.CRITIC: critic_obs}), returns)
         loss = surrogate + self.value_loss_coef * value
-        if self.reference and flat_action is not None and is_flat is not None:
+        if self.reference and flat_action is not None and flat_weight is not None:
             loss = loss + self.reference.loss_weight * losses.retention_loss(
-                distribution.mean, flat_action, is_flat
+                distribution.mean, flat_action, flat_weight
             )
         with torch.no_grad():
             kl = distribution.kl_divergence((mean, std), distribution.params).mean()
@@ -295,19 +295,7 @@ class KirasPPO(PPO):
             scalars[f"Critic/{group}_reward"] = st.rewards[..., g].mean().item()
             scalars[f"Critic/{group}_return"] = st.returns[..., g].mean().item()
             scalars[f"Critic/{group}_value"] = st.values[..., g].mean().item()
-        return scalars | (self._describe_retention() if self.reference else {})
-
-    def _describe_retention(self) -> dict[str, float]:
-        """Return how far the mean actions are from those of the flat policy."""
-        st = self.storage
-        flat, is_flat = (st.observations[key] for key in (names.FLAT_ACTION, names.IS_FLAT))
-        distance = torch.linalg.vector_norm(st.action_mean - flat, dim=-1)
-        weight = is_flat.squeeze(-1).float()
-        on_flat = (distance * weight).sum() / weight.sum().clamp(min=1.0)
-        return {
-            "Residual/distance": distance.mean().item(),
-            "Residual/flat_distance": on_flat.item(),
-        }
+        return scalars | (self.reference.describe(st) if self.reference else {})
 
     # --- construction, modes, state -------------------------------------------------------------
 

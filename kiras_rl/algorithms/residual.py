@@ -8,6 +8,7 @@ from collections.abc import Mapping
 import torch
 
 from kiras_rl import interfaces as names
+from kiras_rl.algorithms.storage import GroupRolloutStorage
 from kiras_rl.models.exported import ExportedPolicy
 from kiras_rl.schema import RetentionConfig
 
@@ -48,6 +49,17 @@ class Reference:
         """
         flat, _ = self.policy(obs[names.PROPRIO], obs[names.HISTORY])
         return flat, -self._reward_weight * torch.linalg.vector_norm(action - flat, dim=-1)
+
+    def describe(self, storage: GroupRolloutStorage) -> dict[str, float]:
+        """Return how far the mean actions of a rollout are from those of the flat policy."""
+        flat, is_flat = (storage.observations[key] for key in (names.FLAT_ACTION, names.IS_FLAT))
+        distance = torch.linalg.vector_norm(storage.action_mean - flat, dim=-1)
+        weight = is_flat.squeeze(-1).float()
+        on_flat = (distance * weight).sum() / weight.sum().clamp(min=1.0)
+        return {
+            "Residual/distance": distance.mean().item(),
+            "Residual/flat_distance": on_flat.item(),
+        }
 
     def state_dict(self) -> dict:
         """Return the frozen weights."""
