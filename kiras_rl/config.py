@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import difflib
+from collections.abc import Iterable
 from dataclasses import asdict
 from functools import cache
 from pathlib import Path
@@ -29,6 +30,10 @@ RESUME_OVERRIDES = ("iterations", "finetuning.iterations", *MACHINE_KEYS)
 """Keys that may change when a run is resumed: none of them changes what was learned so far."""
 
 
+OBSOLETE = ("learner.estimator.learning_rate", "learner.estimator.full_rate_std")
+"""Keys of what earlier versions saved; `learner.estimator.relative_step` is in their place."""
+
+
 class ConfigError(ValueError):
     """A configuration that cannot be used: says what was given and what is allowed."""
 
@@ -50,17 +55,29 @@ def load_config(name: str, overrides: list[str] | tuple[str, ...] = ()) -> Confi
 def config_from_dict(values: dict, overrides: list[str] | tuple[str, ...] = ()) -> Config:
     """Rebuild a configuration from `config_to_dict`, with overrides.
 
-    Keys that are younger than what was saved get the values of base.
+    Keys that are younger than what was saved get the values of base, and those that no longer exist
+    are left out.
 
     Raises:
         ConfigError: As `load_config`.
     """
     source = "the saved configuration"
-    saved = _merge(copy.deepcopy(_schema()), values, source)
+    saved = _merge(copy.deepcopy(_schema()), _without(values, OBSOLETE), source)
     younger = OmegaConf.create()
     for key in OmegaConf.missing_keys(saved):
         OmegaConf.update(younger, key, OmegaConf.select(_base(), key))
     return _resolve([younger], list(overrides), source, begin=saved)
+
+
+def _without(values: dict, keys: Iterable[str]) -> dict:
+    """Return nested values without some keys, which have dots."""
+    values = copy.deepcopy(values)
+    for *path, last in (key.split(".") for key in keys):
+        block = values
+        for name in path:
+            block = block.get(name) or {}
+        block.pop(last, None)
+    return values
 
 
 def config_from_layers(layers: list[dict], source: str) -> Config:

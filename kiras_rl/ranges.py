@@ -28,7 +28,6 @@ POSITIVE = (
     "learner.imitation.premium.capacity",
     "learner.imitation.premium.per_iteration",
     "learner.estimator.epochs",
-    "learner.estimator.full_rate_std",
     "evaluation.worlds_per_skill",
     "evaluation.terrain.robots",
     "finetuning.iterations",
@@ -49,7 +48,7 @@ NOT_NEGATIVE = (
     "learner.ppo.learning_rate",  # at 0 a part does not learn
     "learner.ppo.learning_rate_range",
     "learner.imitation.discriminator.learning_rate",
-    "learner.estimator.learning_rate",
+    "learner.estimator.relative_step",
     "learner.estimator.latent_dim",  # at 0 the context is the velocity alone
 )
 """Of a list every number."""

@@ -176,8 +176,7 @@ class EstimatorConfig:
     latent_dim: int
     encoder_dims: list[int]
     decoder_dims: list[int]
-    learning_rate: float
-    full_rate_std: float
+    relative_step: float
     epochs: int
     kl_weight: float
     prior_weight: float

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from dataclasses import fields, is_dataclass
 from typing import get_args, get_origin, get_type_hints
 
@@ -90,6 +91,18 @@ def test_a_saved_configuration_is_the_same_one(tmp_path):
     assert config_from_dict(config_to_dict(config)) == config
     save_config(config, tmp_path / "config.yaml")
     assert load_config(str(tmp_path / "config.yaml")) == config
+
+
+@pytest.mark.parametrize("overrides", [(), ["learner.estimator=null"]], ids=str)
+def test_what_an_earlier_version_saved_is_read(overrides):
+    config = load_config("solo8", overrides)
+    values = config_to_dict(config)
+    if values["learner"]["estimator"]:
+        del values["learner"]["estimator"]["relative_step"]
+        values["learner"]["estimator"] |= {"learning_rate": 1e-3, "full_rate_std": 0.5}
+    before = copy.deepcopy(values)
+    assert config_from_dict(values) == config
+    assert values == before
 
 
 @pytest.mark.parametrize("name", list_configs())

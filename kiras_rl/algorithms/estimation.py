@@ -45,7 +45,7 @@ class Estimation:
         self.config = config
         self.estimator = estimator.to(device)
         self._device = device
-        self._learning_rate = torch.tensor(config.learning_rate, device=device)
+        self._learning_rate = torch.zeros((), device=device)
         self.optimizer = make_adam(self.estimator.parameters(), self._learning_rate, device)
         self._data: dict[str, torch.Tensor] = {}
         self._num_mini_batches = 1
@@ -88,18 +88,23 @@ class Estimation:
             context = torch.cat([velocity, context[:, VELOCITY_DIM:]], dim=-1)
         return context
 
-    def scale_steps(self, action_std: float) -> None:
-        """Take steps from now on that fit an action noise; see `full_rate_std` of cfg/base.yaml."""
-        share = min(1.0, action_std / self.config.full_rate_std)
-        self._learning_rate.fill_(share * self.config.learning_rate)
-
     def record(self, rewards: torch.Tensor, dones: torch.Tensor) -> None:
         """Let AdaBoot see a step's rewards and dones, (N,)."""
         self.adaboot.record(rewards, dones)
 
-    def update(self, storage: GroupRolloutStorage, num_mini_batches: int) -> dict[str, float]:
-        """Train on the rollout unless AdaBoot withholds it; return scalars for the log."""
+    def update(
+        self, storage: GroupRolloutStorage, num_mini_batches: int, actor_rate: torch.Tensor
+    ) -> dict[str, float]:
+        """Train on the rollout unless AdaBoot withholds it; return scalars for the log.
+
+        Args:
+            storage: The rollout.
+            num_mini_batches: Gradient steps of a pass over it.
+            actor_rate: Step size of the actor. A step here changes what the actor is told, and so
+                its actions, past PPO's trust region: the actor must be able to follow.
+        """
         self.adaboot.renew()
+        torch.mul(actor_rate, self.config.relative_step, out=self._learning_rate)
         trained = self.adaboot.update_allowed()
         scalars = {
             "AdaBoot/trust": self.adaboot.probability.item(),

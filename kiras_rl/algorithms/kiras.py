@@ -165,7 +165,9 @@ class KirasPPO(PPO):
         scalars = self._describe_rollout()
         scalars |= self._update_policy()
         if self.estimation:
-            scalars |= self.estimation.update(self.storage, self.num_mini_batches)
+            scalars |= self.estimation.update(
+                self.storage, self.num_mini_batches, self.learning_rate
+            )
         if self.imitation:
             scalars |= self.imitation.update(self.storage, self.iteration, self.progress)
         self.storage.clear()
@@ -258,16 +260,11 @@ class KirasPPO(PPO):
         return kl
 
     def _apply_schedules(self) -> None:
-        """Set action noise and step sizes of the next iteration.
-
-        A step of the estimator changes what the actor is told, and so its actions, past PPO's trust
-        region: by a KL divergence that grows as the noise falls. So its step size falls with it.
-        """
-        std = piecewise_linear(self.config.ppo.action_std, self.progress)
-        self.actor.distribution.std_param.fill_(std)
+        """Set the action noise and the KL divergence of the next iteration."""
+        self.actor.distribution.std_param.fill_(
+            piecewise_linear(self.config.ppo.action_std, self.progress)
+        )
         self.desired_kl.fill_(piecewise_linear(self.config.ppo.desired_kl, self.progress))
-        if self.estimation:
-            self.estimation.scale_steps(std)
 
     # --- skills ---------------------------------------------------------------------------------
 

@@ -14,6 +14,7 @@ from kiras_rl.models.estimator import ContextEstimator
 from kiras_rl.schema import EstimatorConfig
 
 STEPS, WORLDS, PROPRIO, FRAMES, SKILLS, LATENT = 8, 64, 4, 2, 2, 3
+RATE = torch.tensor(3e-3)  # of the actor
 
 
 @pytest.fixture
@@ -22,8 +23,8 @@ def make_estimation():
 
     def make(adaboot="off", floor=0.0):
         config = EstimatorConfig(
-            latent_dim=LATENT, encoder_dims=[32], decoder_dims=[32], learning_rate=3e-3,
-            full_rate_std=0.5, epochs=1,
+            latent_dim=LATENT, encoder_dims=[32], decoder_dims=[32], relative_step=1.0,
+            epochs=1,
             kl_weight=0.01, prior_weight=1e-3, adaboot=adaboot, adaboot_floor=floor,
         )  # fmt: skip
         network = ContextEstimator(PROPRIO, FRAMES, SKILLS, LATENT, [32], [32])
@@ -51,7 +52,7 @@ def storage():
 
 def test_it_learns_to_tell_the_velocity(make_estimation, storage):
     estimation = make_estimation()
-    errors = [estimation.update(storage, 4)["Estimator/velocity"] for _ in range(100)]
+    errors = [estimation.update(storage, 4, RATE)["Estimator/velocity"] for _ in range(100)]
     assert errors[0] > 1.5  # the variance of a difference of two normal numbers is 2
     assert errors[-1] < 0.1
 
@@ -60,9 +61,9 @@ def test_the_frame_after_an_end_is_not_predicted(make_estimation, storage):
     ended = storage.dones > 0
     target = storage.observations[names.NEXT_PROPRIO]
     target.copy_(torch.where(ended, 1e6, target))
-    assert make_estimation().update(storage, 1)["Estimator/prediction"] < 10.0
+    assert make_estimation().update(storage, 1, RATE)["Estimator/prediction"] < 10.0
     target.copy_(torch.where(ended, target, 1e3))
-    assert make_estimation().update(storage, 1)["Estimator/prediction"] > 1e5
+    assert make_estimation().update(storage, 1, RATE)["Estimator/prediction"] > 1e5
 
 
 def test_the_prior_starts_standard_normal_and_follows_the_latents(make_estimation, storage):
@@ -70,7 +71,7 @@ def test_the_prior_starts_standard_normal_and_follows_the_latents(make_estimatio
     skill = torch.eye(SKILLS)
     mean, log_var = estimation.estimator.prior_of(skill)
     assert not mean.any() and not log_var.any()
-    estimation.update(storage, 4)
+    estimation.update(storage, 4, RATE)
     assert estimation.estimator.prior_of(skill)[0].abs().min() > 0
 
 
@@ -78,7 +79,7 @@ def test_a_withheld_update_changes_nothing(make_estimation, storage):
     estimation = make_estimation("gate_update", floor=0.0)
     estimation.record(torch.full((WORLDS,), -1.0), torch.ones(WORLDS))  # no trust at all
     before = [p.clone() for p in estimation.estimator.parameters()]
-    assert estimation.update(storage, 4) == {"AdaBoot/trust": 0.0, "AdaBoot/trained": 0.0}
+    assert estimation.update(storage, 4, RATE) == {"AdaBoot/trust": 0.0, "AdaBoot/trained": 0.0}
     for old, new in zip(before, estimation.estimator.parameters(), strict=True):
         assert torch.equal(old, new)
 

@@ -50,23 +50,18 @@ def test_the_step_size_that_is_logged_is_the_optimizer_s(make_runner):
         alg.load(copy.deepcopy(alg.save()))
 
 
-def test_the_estimator_takes_smaller_steps_as_the_action_noise_falls(make_runner):
-    changes = ["learner.ppo.action_std=[[0,0.5],[0.5,0.1]]", "learner.estimator.learning_rate=0.01"]
-    alg = make_runner("iterations=8", *changes).alg
-    rates = []
-    for iteration in (0, 2, 8):
-        alg.load(copy.deepcopy(alg.save()) | {"iteration": iteration})
-        rates += [group["lr"].item() for group in alg.estimation.optimizer.param_groups]
-    assert rates == pytest.approx([0.01, 0.006, 0.002])  # noise: 0.5, 0.3, 0.1
-
-
-@pytest.mark.parametrize(("std", "rate"), [(0.1, 0.002), (0.8, 0.01)])
-def test_what_the_rest_of_a_schedule_holds_does_not_matter_to_the_estimator(make_runner, std, rate):
-    alg = make_runner(
-        f"learner.ppo.action_std=[[0,{std}],[1,0.05]]", "learner.estimator.learning_rate=0.01"
-    ).alg
-    rates = [group["lr"].item() for group in alg.estimation.optimizer.param_groups]
-    assert rates == pytest.approx([rate])
+@pytest.mark.parametrize(("kl", "rate"), [(1e9, 2e-3), (1e-12, 5e-4)])  # never too far, always
+def test_the_estimator_takes_steps_in_proportion_to_those_of_the_actor(make_runner, kl, rate):
+    runner = make_runner(
+        f"learner.ppo.desired_kl=[[0,{kl}]]",
+        "learner.ppo.learning_rate_range=[5.0e-4,2.0e-3]",
+        "learner.estimator.relative_step=0.3",
+        "learner.estimator.adaboot=off",
+    )
+    runner.learn(1)
+    assert runner.alg.learning_rate == pytest.approx(rate)
+    [group] = runner.alg.estimation.optimizer.param_groups
+    assert group["lr"] == pytest.approx(0.3 * rate)
 
 
 @pytest.mark.parametrize("without", [(), *[(part,) for part in PARTS], PARTS], ids="-".join)

@@ -109,7 +109,7 @@ def test_a_sweep_stops_goes_on_and_grows(tmp_path, capsys, interrupt):
     before = contents(sweep / "kiras")
 
     # one more configuration, which breaks; a key of the machine may change
-    overrides = "[learner.estimator.learning_rate=1e30, learner.estimator.adaboot=off]"
+    overrides = "[learner.estimator.relative_step=1e30, learner.estimator.adaboot=off]"
     broken = f"{{cfg: smoke, overrides: {overrides}}}"
     write(tmp_path / "a.yaml", f"{{broken: {broken}, {configs[1:-1]}}}", "[1]")
     interrupt(0)  # never
@@ -164,7 +164,7 @@ def test_a_sweep_compares_all_configurations_of_a_seed_first(tmp_path, capsys, i
 
 def test_jobs_train_what_each_run_would_have_trained_alone(tmp_path, capsys):
     runs, jobs = tmp_path / "runs", min(2, len(os.sched_getaffinity(0)))
-    overrides = "[learner.estimator.learning_rate=1e30, learner.estimator.adaboot=off]"
+    overrides = "[learner.estimator.relative_step=1e30, learner.estimator.adaboot=off]"
     configs = f"{{kiras: smoke, broken: {{cfg: smoke, overrides: {overrides}}}}}"
     command = ["--sweep", write(tmp_path / "a.yaml", configs, "[1]"), "--runs", str(runs)]
     before = os.sched_getaffinity(0)
