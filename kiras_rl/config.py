@@ -29,7 +29,6 @@ MACHINE_KEYS = ("device", "sim.threads", "checkpoint_minutes")
 RESUME_OVERRIDES = ("iterations", "finetuning.iterations", *MACHINE_KEYS)
 """Keys that may change when a run is resumed: none of them changes what was learned so far."""
 
-
 OBSOLETE = ("learner.estimator.learning_rate", "learner.estimator.full_rate_std")
 """Keys of what earlier versions saved; `learner.estimator.relative_step` is in their place."""
 

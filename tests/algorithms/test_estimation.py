@@ -24,8 +24,7 @@ def make_estimation():
     def make(adaboot="off", floor=0.0):
         config = EstimatorConfig(
             latent_dim=LATENT, encoder_dims=[32], decoder_dims=[32], relative_step=1.0,
-            epochs=1,
-            kl_weight=0.01, prior_weight=1e-3, adaboot=adaboot, adaboot_floor=floor,
+            epochs=1, kl_weight=0.01, prior_weight=1e-3, adaboot=adaboot, adaboot_floor=floor,
         )  # fmt: skip
         network = ContextEstimator(PROPRIO, FRAMES, SKILLS, LATENT, [32], [32])
         return Estimation(config, network, WORLDS, "cpu")
