@@ -287,11 +287,11 @@ class KirasPPO(PPO):
         one_hot = st.observations[names.SKILL].flatten(0, 1)  # (T N, S)
         self._practised = one_hot.sum(dim=0)
         scalars = {"Policy/advantage_weight_task": self._weights()[TASK]}
-        groups = ("task", "imitation")[: st.rewards.shape[-1]]
-        for g, group in enumerate(groups):
-            scalars[f"Critic/{group}_reward"] = st.rewards[..., g].mean().item()
-            scalars[f"Critic/{group}_return"] = st.returns[..., g].mean().item()
-            scalars[f"Critic/{group}_value"] = st.values[..., g].mean().item()
+        for g, group in enumerate(("task", "imitation")[: st.rewards.shape[-1]]):
+            kinds = {"reward": st.rewards, "return": st.returns, "value": st.values}
+            scalars |= {f"Critic/{group}_{k}": x[..., g].mean().item() for k, x in kinds.items()}
+            spread = (st.returns - st.values)[..., g].std()
+            scalars[f"Critic/{group}_advantage_std"] = spread.item()
         return scalars | (self.reference.describe(st) if self.reference else {})
 
     # --- construction, modes, state -------------------------------------------------------------
