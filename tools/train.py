@@ -39,7 +39,7 @@ cores. The same command goes on where it was interrupted.
 
 EXAMPLES = """\
 examples:
-  kiras-train --cfg solo8_quick                       ten minutes on two CPU cores
+  kiras-train --cfg solo8_quick                       twelve minutes on two CPU cores
   kiras-train --cfg solo8 num_envs=2048 seed=2        set keys
   kiras-train --cfg ablations/no_sil iterations=300   a part of the method left out
   kiras-train --cfg mine.yaml                         your own file, with "extends: solo8"
