@@ -97,6 +97,7 @@ class KirasRunner(OnPolicyRunner):
         self.seconds, self.steps = 0.0, 0  # of training, over all phases and resumes
         self.begun_from: str | None = None  # another run's checkpoint that finetuning began with
         self._writer: SummaryWriter | None = None
+        self._resumed = False
         self._last_saved = time.monotonic()
 
     def _configure_multi_gpu(self) -> None:
@@ -253,10 +254,10 @@ class KirasRunner(OnPolicyRunner):
 
     def _open_log(self) -> None:
         if self.run_dir is not None and distributed.is_main():
-            # purge_step: after a resume, points that a lost stretch had written disappear
-            self._writer = SummaryWriter(
-                str(self.run_dir), purge_step=self.current_learning_iteration + 1, flush_secs=10
-            )
+            # After a resume, points that a lost stretch had written disappear. Only then: two phases
+            # may begin within a second, and readers do not take the logs of one second in order.
+            purge = self.current_learning_iteration + 1 if self._resumed else None
+            self._writer = SummaryWriter(str(self.run_dir), purge_step=purge, flush_secs=10)
 
     def _write(self, scalars: dict[str, float]) -> None:
         if self._writer is not None:
@@ -344,6 +345,7 @@ class KirasRunner(OnPolicyRunner):
             raise checkpoint.CheckpointError(
                 f"{path} is of the phase {content['phase']}, not of {self.phase}"
             )
+        self._resumed = True
         self.alg.load(content["learner"], load_cfg, strict)
         self.current_learning_iteration = content["iteration"]
         self.seconds, self.best_score = content["seconds"], content["best_score"]

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import signal
 import threading
+from types import SimpleNamespace
 
 import pytest
 import torch
+from tensorboard.summary.writer import event_file_writer
 
 from kiras_rl.checkpoint import CheckpointError, load_checkpoint, save_checkpoint
 from kiras_rl.config import list_configs, load_config
@@ -16,6 +19,7 @@ from kiras_rl.phases import FINETUNING, SKILL_LEARNING, phase_config
 from kiras_rl.process import StopRequest
 from kiras_rl.runner import Evaluators, KirasRunner
 from kiras_rl.soundness import TrainingError
+from kiras_rl.tools.curves import read_scalars
 
 # Noise, randomization and delay are on; episodes and premium windows end many times.
 TINY = (
@@ -78,6 +82,21 @@ def differences(a, b, path=""):
         same = a.dtype == b.dtype and torch.equal(torch.nan_to_num(a), torch.nan_to_num(b))
         return [] if same else [path]
     return [] if a == b else [path]
+
+
+def test_the_log_holds_both_phases_whatever_its_files_are_called(make_runner, monkeypatch):
+    """Names are of the second and a counter, and readers sort them as text: 10 before 9."""
+    monkeypatch.setattr(event_file_writer, "time", SimpleNamespace(time=lambda: 1.8e9))
+    counter = SimpleNamespace(get=itertools.count(9).__next__)
+    monkeypatch.setattr(event_file_writer, "_global_uid", counter)
+    flat = make_runner("run", *ROUGH)
+    assert flat.learn()
+    rough = make_runner("run", *ROUGH, phase=FINETUNING)
+    rough.begin_from(latest(flat))
+    rough.learn(2)
+    log = read_scalars(rough.run_dir)
+    assert log["Critic/task_reward"][0] == [1, 2, 3, 4]
+    assert log["Residual/distance"][0] == [3, 4]
 
 
 def test_a_resumed_training_ends_with_the_same_bits(make_runner):

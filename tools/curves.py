@@ -108,7 +108,8 @@ def read_scalars(run_dir: Path) -> Series:
 
     log = EventAccumulator(str(run_dir), size_guidance={"scalars": 0})
     log.Reload()
-    return {
-        tag: ([e.step for e in log.Scalars(tag)], [e.value for e in log.Scalars(tag)])
-        for tag in log.Tags()["scalars"]
-    }
+    series = {}
+    for tag in log.Tags()["scalars"]:
+        events = sorted(log.Scalars(tag), key=lambda event: event.step)  # files come in any order
+        series[tag] = [e.step for e in events], [e.value for e in events]
+    return series
