@@ -254,8 +254,8 @@ class KirasRunner(OnPolicyRunner):
 
     def _open_log(self) -> None:
         if self.run_dir is not None and distributed.is_main():
-            # After a resume, points that a lost stretch had written disappear. Only then: two phases
-            # may begin within a second, and readers do not take the logs of one second in order.
+            # After a resume, points that a lost stretch had written disappear. Only then: two
+            # phases may begin in one second, whose logs readers do not take in order.
             purge = self.current_learning_iteration + 1 if self._resumed else None
             self._writer = SummaryWriter(str(self.run_dir), purge_step=purge, flush_secs=10)
 
