@@ -41,8 +41,11 @@ def summarise(values: list[float]) -> dict[str, float]:
 
 
 def wait_for(device: torch.device | str) -> None:
-    """Wait until a device has done what it was asked; a CPU always has."""
-    if torch.device(device).type == "cuda":
+    """Wait until a device has done what it was asked; a CPU always has.
+
+    While a graph is recorded nothing is done, and waiting is forbidden.
+    """
+    if torch.device(device).type == "cuda" and not torch.cuda.is_current_stream_capturing():
         torch.cuda.synchronize(device)
 
 

@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 from rich.table import Table
 
 from kiras_rl.phases import phases_of
+from kiras_rl.recorded import WARM_UP
 from kiras_rl.tools.benchmarks.request import Figures, Request
 from kiras_rl.tools.benchmarks.tables import make_table
 from kiras_rl.tools.benchmarks.training import Training
@@ -33,7 +34,13 @@ PARTS = (
     ("alg.estimation", "update", "estimator"),
     ("alg.imitation", "update", "discriminator"),
 )
-"""(owner, method, part): what an iteration is divided into; what is none of them is the rest."""
+"""(owner, method, part): what an iteration is divided into; what is none of them is the rest.
+
+On a GPU much of it is inside graphs, which only their caller is timed for.
+"""
+
+FIRST_OF_GRAPH = {"rewards, terminations, features": "what follows the physics"}
+"""Part -> what it is called where the parts that it calls are in one graph with it."""
 
 
 def measure(request: Request) -> Figures:
@@ -59,17 +66,20 @@ def measure(request: Request) -> Figures:
 def _time_parts(request: Request, phase: str) -> Times:
     """Return the seconds of each part of an iteration, one a round."""
     training = Training(request.config, request.device, phase)
+    for _ in range(WARM_UP + 1):  # on a GPU graphs are recorded, which waits for nothing
+        training.iterate()
     timer = PartTimer(request.device)
     timer.wrap_all(training.runner, PARTS)
     times: Times = {part: [] for part in (*timer.seconds, REST)}
-    training.iterate()  # warms up
     for _ in range(request.rounds):
         timer.clear()
         whole = training.iterate()
         for part, seconds in timer.seconds.items():
             times[part].append(seconds)
         times[REST].append(whole - sum(timer.seconds.values()))
-    return times
+    if request.device == "cpu":
+        return times
+    return {FIRST_OF_GRAPH.get(part, part): values for part, values in times.items() if any(values)}
 
 
 def table(figures: Figures) -> list[Table]:
@@ -92,7 +102,8 @@ def table(figures: Figures) -> list[Table]:
 def _parts_of(figures: Figures) -> list[str]:
     """Return the parts that any phase has, in their order."""
     present = {part for seconds in figures["seconds"].values() for part in seconds}
-    return [part for part in (*(part for *_, part in PARTS), REST) if part in present]
+    named = (name for *_, part in PARTS for name in (part, FIRST_OF_GRAPH.get(part)))
+    return [part for part in (*named, REST) if part in present]
 
 
 def plot(figures: Figures, path: Path) -> None:
