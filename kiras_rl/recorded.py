@@ -22,6 +22,11 @@ _log = logging.getLogger(__name__)
 T = TypeVar("T")
 Slot = tuple[object, str]  # an attribute: its owner, and its name with dots
 
+COMPILER = {"unroll_reductions_threshold": 33}
+"""Options of torch.compile. Sums over joints, feet and reward terms become additions in a row: the
+kernels with a dimension of 8 to reduce, which it would write, crash Triton 3.6 (operand does not
+dominate its use, in `tritongpu-remove-layout-conversions`)."""
+
 WARM_UP = 2  # calls before the recording: libraries and optimizers allocate at their first
 
 
@@ -56,7 +61,9 @@ class Recorded:
         self.records = enabled and torch.device(device).type == "cuda"
         self._function = function
         if self.records and compiled:
-            self._function = torch.compile(function, fullgraph=True, dynamic=False)
+            self._function = torch.compile(
+                function, fullgraph=True, dynamic=False, options=COMPILER
+            )
         self._slots: list[tuple[Slot, torch.Tensor]] = []
         self._recording: _Recording | None = None
         self._of: Hashable = None  # of no variant
@@ -84,7 +91,9 @@ class Recorded:
         try:
             return _aside(self._function)
         except TorchDynamoException as error:  # no compiler for C, say
-            reason = " ".join(str(error).split())[:200]
+            reason = " ".join(str(error).split())  # which kernel first, what is wrong with it last
+            if len(reason) > 400:
+                reason = f"{reason[:100]} ... {reason[-300:]}"
             _log.warning("torch.compile failed, training goes on a little slower: %s", reason)
             self._function = self._plain
             return _aside(self._function)

@@ -6,6 +6,7 @@ import torch
 from kiras_rl.config import load_config
 from kiras_rl.envs import make_env
 from kiras_rl.phases import FINETUNING, SKILL_LEARNING, phase_config
+from kiras_rl.recorded import Recorded
 
 
 def build(cfg, phase, device):
@@ -99,3 +100,9 @@ def test_replayed_steps_are_the_same(phase, device, request):
     for state in (end, end_seen):
         state.pop("generator"), state.pop("sim")
     assert_same(end, end_seen)
+
+
+def test_the_compiler_knows_its_options():
+    Recorded(lambda: (), "cuda", compiled=True)  # torch.compile refuses what it does not know
+    with pytest.raises(RuntimeError, match="Unexpected optimization option"):
+        torch.compile(lambda: (), options={"unroll_reduction_threshold": 33})
