@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
+import statistics
 
 import pytest
 import torch
@@ -100,6 +101,16 @@ def test_the_exported_policy_is_the_mean_of_the_trained_one(make_runner, overrid
     with torch.no_grad():
         alg.act(obs)
     torch.testing.assert_close(alg.act_deterministic(obs), alg.actor.output_mean)
+
+
+def test_the_log_tells_how_far_the_advantages_of_each_group_spread(make_runner):
+    runner = make_runner()
+    collect(runner)
+    advantages = (runner.alg.storage.returns - runner.alg.storage.values).flatten(0, 1).clone()
+    scalars = runner.alg.update()
+    for index, group in ((TASK, "task"), (IMITATION, "imitation")):
+        spread = statistics.stdev(advantages[:, index].tolist())
+        assert scalars[f"Critic/{group}_advantage_std"] == pytest.approx(spread, rel=1e-4)
 
 
 def test_no_pair_of_features_straddles_a_reset(make_runner):
