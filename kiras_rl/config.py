@@ -29,7 +29,11 @@ MACHINE_KEYS = ("device", "sim.threads", "checkpoint_minutes")
 RESUME_OVERRIDES = ("iterations", "finetuning.iterations", *MACHINE_KEYS)
 """Keys that may change when a run is resumed: none of them changes what was learned so far."""
 
-OBSOLETE = ("learner.estimator.learning_rate", "learner.estimator.full_rate_std")
+OBSOLETE = tuple(
+    f"{phase}learner.estimator.{key}"
+    for phase in ("", "finetuning.")
+    for key in ("learning_rate", "full_rate_std")
+)
 """Keys of what earlier versions saved; `learner.estimator.relative_step` is in their place."""
 
 

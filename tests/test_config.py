@@ -18,7 +18,7 @@ from kiras_rl.config import (
     save_config,
 )
 from kiras_rl.envs import make_env
-from kiras_rl.phases import FINETUNING, phase_config
+from kiras_rl.phases import FINETUNING, SKILL_LEARNING, phase_config
 from kiras_rl.ranges import NOT_NEGATIVE, POSITIVE, RANGES, SCHEDULES, TERMS
 from kiras_rl.runner import KirasRunner
 from kiras_rl.schema import Config
@@ -100,8 +100,11 @@ def test_what_an_earlier_version_saved_is_read(overrides):
     if values["learner"]["estimator"]:
         del values["learner"]["estimator"]["relative_step"]
         values["learner"]["estimator"] |= {"learning_rate": 1e-3, "full_rate_std": 0.5}
+        values["finetuning"]["learner"]["estimator"] = {"learning_rate": 1e-3}
     before = copy.deepcopy(values)
-    assert config_from_dict(values) == config
+    read = config_from_dict(values)
+    for phase in (SKILL_LEARNING, FINETUNING):
+        assert phase_config(read, phase) == phase_config(config, phase)
     assert values == before
 
 
