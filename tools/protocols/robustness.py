@@ -25,7 +25,7 @@ TEXT = (
 DURATION = 10.0  # s
 # At a friction of 0.1 and less the few of training leave contacts unsolved: worlds diverge, and
 # robots fall that do not with more.
-SOLVER_ITERATIONS = 20
+SOLVER_ITERATIONS = 20  # at least
 
 
 @dataclass(frozen=True)
@@ -102,7 +102,7 @@ def measure(subject: Subject) -> dict:
 
     def run(sweep: Sweep, value: float) -> dict:
         config = subject.flat()
-        config.sim.solver_iterations = SOLVER_ITERATIONS
+        config.sim.solver_iterations = max(config.sim.solver_iterations, SOLVER_ITERATIONS)
         sweep.apply(config.env.randomization, value)
         worlds = options.robots * len(subject.skills)
         env = subject.make_env(config, worlds, DURATION)
