@@ -12,6 +12,7 @@ import pytest
 from kiras_rl.deploy.policy import OnboardPolicy
 from kiras_rl.tools.evaluate import main
 from kiras_rl.tools.protocols import robustness
+from kiras_rl.tools.protocols.subject import Subject
 
 SKILLS = ["walk", "crawl", "stilt", "pitch_up", "pitch_down"]
 
@@ -174,3 +175,17 @@ def test_only_what_is_missing_is_measured_and_it_is_the_same_again(finished, tmp
     assert 0 < len(measured) <= 2 * 180  # steps of the longest two results
     assert results(tmp_path) == all_of_them
     assert (tmp_path / "report.html").read_text() == (folder / "report.html").read_text()
+
+
+def test_robustness_solves_contacts_on_ice(short, tmp_path, monkeypatch):
+    """With the 6 solver iterations of training robots fall on ice that do not with 20."""
+    make_env, iterations = Subject.make_env, []
+
+    def noting(self, *args):
+        env = make_env(self, *args)
+        iterations.append(env.sim.model.opt.iterations)
+        return env
+
+    monkeypatch.setattr(Subject, "make_env", noting)
+    assert evaluate("robustness", tmp_path) == 0
+    assert set(iterations) == {20}
