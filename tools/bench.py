@@ -175,7 +175,12 @@ def bench(args: argparse.Namespace) -> None:
     """
     config = _config(args)
     request = Request(
-        config, args.rounds, resolve_device(config.device), sizes=args.worlds, peer=args.peer
+        config,
+        args.rounds,
+        resolve_device(config.device),
+        sizes=args.worlds,
+        peer=args.peer,
+        tell=console.print,
     )
     report: dict[str, Figures] = {"machine": _machine(config), "settings": _settings(args)}
     tables = [_facts("machine", report["machine"])]

@@ -210,6 +210,7 @@ def test_worlds_are_added_until_memory_is_short(bench, tmp_path):
         assert size["steps_per_second"] == pytest.approx(size["worlds"] / size["seconds_per_step"])
         assert size["memory_bytes"] > 0
     assert measured["variants"] == {}  # nothing but what was asked for
+    assert [f"{n} worlds: " in out for n in (4, 8)] == [True, True]  # told before the table
     assert (tmp_path / "scale.png").read_bytes().startswith(b"\x89PNG")
 
 

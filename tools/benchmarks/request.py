@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -21,6 +22,7 @@ class Request:
         device: "cpu" or a CUDA device, for the parts that run on either.
         sizes: Numbers of worlds of the part `scale`; empty for doubling until memory is short.
         peer: Interpreter of the environment in which mjlab is installed, of the part `peer`.
+        tell: Takes a line on what a long part has measured so far, which an end of it would lose.
     """
 
     config: Config
@@ -28,6 +30,7 @@ class Request:
     device: str
     sizes: tuple[int, ...] = ()
     peer: str | None = None
+    tell: Callable[[str], None] = lambda line: None
 
 
 def native(config: Config) -> Config:

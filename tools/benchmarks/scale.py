@@ -59,7 +59,7 @@ def measure(request: Request) -> Figures:
         "stopped": stopped,
         "worlds": flat.num_envs,
         "variants": {
-            name: _alone(config, request, skills)
+            name: _alone(name, config, request, skills)
             for name, (config, skills) in _variants(request.config).items()
             if not request.sizes
         },
@@ -73,7 +73,7 @@ def _grow(request: Request, config: Config) -> tuple[list[Figures], str | None]:
         if sizes and (short := _too_large(sizes[-1], worlds, request.device)):
             return sizes, short
         try:
-            sizes.append(_alone(replace(config, num_envs=worlds), request))
+            sizes.append(_alone(f"{worlds:,} worlds", replace(config, num_envs=worlds), request))
         except (BrokenProcessPool, MemoryError, RuntimeError) as error:
             if not sizes or not _is_memory(error):
                 raise
@@ -116,11 +116,15 @@ def _variants(config: Config) -> dict[str, tuple[Config, int | None]]:
     return variants
 
 
-def _alone(config: Config, request: Request, skills: int | None = None) -> Figures:
-    """Measure an environment in a process that does nothing else."""
+def _alone(name: str, config: Config, request: Request, skills: int | None = None) -> Figures:
+    """Measure an environment in a process that does nothing else, and tell."""
     spawn = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(1, mp_context=spawn) as pool:
-        return pool.submit(measure_one, config, request.device, request.rounds, skills).result()
+        work = pool.submit(measure_one, config, request.device, request.rounds, skills)
+        figures = work.result()
+    rate, memory = figures["steps_per_second"], figures["memory_bytes"]
+    request.tell(f"{name}: {rate:,.0f} env steps/s, {memory / 1e6:,.0f} MB")
+    return figures
 
 
 def measure_one(config: Config, device: str, rounds: int, skills: int | None = None) -> Figures:
@@ -230,6 +234,7 @@ def plot(figures: Figures, path: Path) -> None:
         axes.set_xticks(worlds)
         axes.xaxis.set_major_formatter(ScalarFormatter())
         axes.xaxis.set_minor_formatter(NullFormatter())
+        axes.tick_params(axis="x", labelrotation=30)
         axes.set_xlabel("worlds")
         axes.grid(alpha=0.3)
     figure.suptitle(f"{figures['robot']}, {figures['backend']} on {figures['device']}")
