@@ -10,10 +10,18 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from kiras_rl.robots.kinematics import KNEES, Leg, LegError, ReachError, find_legs
-from kiras_rl.robots.reading import RobotError, check_keys, frozen, hint, number, read_yaml
+from kiras_rl.robots.kinematics import KNEES, Leg, LegError, ReachError, find_legs, leg_length
+from kiras_rl.robots.reading import (
+    RobotError,
+    check_keys,
+    frozen,
+    hint,
+    number,
+    per_name,
+    read_yaml,
+)
 
-_KEYS = ("base_height", "pitch", "knees", "joint_pos")
+_KEYS = ("base_height", "pitch", "knees", "feet_ahead", "joint_pos")
 
 _LIMIT_SLACK = 1e-3
 """rad; angles written with three decimals may sit on a limit."""
@@ -55,18 +63,13 @@ class KeyframeReader:
     base_body: str
     foot_geoms: tuple[str, ...]
     foot_radius: float
+    joint_limits: np.ndarray
+    """Lowest and highest angle of each joint. Shape (J, 2), rad."""
 
     @functools.cached_property
     def legs(self) -> tuple[Leg, ...]:
         """The legs that inverse kinematics works on."""
         return find_legs(self.model, self.base_body, self.foot_geoms)
-
-    @property
-    def joint_range(self) -> np.ndarray:
-        """Position limits. Shape (J, 2), rad; infinite for a joint without limits."""
-        ids = [self.model.joint(joint).id for joint in self.joint_names]
-        limited = self.model.jnt_limited[ids, None].astype(bool)
-        return np.where(limited, self.model.jnt_range[ids], (-np.inf, np.inf))
 
     def read(self) -> tuple[Keyframe, ...]:
         """Return all keyframes in the order of the file.
@@ -86,8 +89,11 @@ class KeyframeReader:
         height = number(entry["base_height"], "base_height", where)
         pitch = np.deg2rad(number(entry["pitch"], "pitch", where))
         if "knees" in entry:
-            joint_pos = self._solve(name, height, pitch, entry["knees"], where)
+            ahead = per_name("feet_ahead", entry.get("feet_ahead", 0.0), self.foot_geoms, where)
+            joint_pos = self._solve(name, height, pitch, entry["knees"], ahead, where)
         else:
+            if "feet_ahead" in entry:
+                raise RobotError(f"feet_ahead goes with knees, not with joint_pos, in {where}")
             joint_pos = self._given(entry["joint_pos"], where)
         self._check_limits(name, joint_pos)
         return Keyframe(str(name), height, float(pitch), frozen(joint_pos))
@@ -100,8 +106,10 @@ class KeyframeReader:
             )
         return np.array([number(angle, "joint_pos", where) for angle in joint_pos])
 
-    def _solve(self, name: str, height: float, pitch: float, knees: Any, where: str) -> np.ndarray:
-        """Return the joint angles with every foot vertically below its hip. Shape (J,), rad."""
+    def _solve(
+        self, name: str, height: float, pitch: float, knees: Any, ahead: np.ndarray, where: str
+    ) -> np.ndarray:
+        """Return the joint angles with every foot `ahead` of its hip, (F,) m. Shape (J,), rad."""
         if knees not in KNEES:
             raise RobotError(
                 f"knees must be one of {', '.join(KNEES)}, not {knees!r}{hint(knees, KNEES)}, "
@@ -109,20 +117,23 @@ class KeyframeReader:
             )
         joint_pos = np.zeros(len(self.joint_names))  # abduction joints, where there are, stay at 0
         try:
-            for leg in self.legs:
+            for leg, distance in zip(self.legs, ahead, strict=True):
                 back = knees == "back" or (knees == "inward" and leg.hip[0] > 0)
-                length = leg.hip_height(height, pitch) - self.foot_radius
-                angles = leg.foot_below_hip(length, pitch, back)
+                below = leg.hip_height(height, pitch) - self.foot_radius
+                angles = leg.reach_foot(below, float(distance), pitch, back)
                 joint_pos[[leg.hip_joint, leg.knee_joint]] = angles
         except LegError as error:
             raise RobotError(f"{error}, in {where}") from error
         except ReachError as error:
-            raise RobotError(self._unreachable(name, pitch, height)) from error
+            raise RobotError(self._unreachable(name, pitch, height, ahead)) from error
         return joint_pos
 
-    def _unreachable(self, name: str, pitch: float, height: float) -> str:
+    def _unreachable(self, name: str, pitch: float, height: float, ahead: np.ndarray) -> str:
         """Describe the leg that is furthest outside its reach, and by how much."""
-        lengths = [leg.hip_height(height, pitch) - self.foot_radius for leg in self.legs]
+        lengths = [
+            leg_length(leg.hip_height(height, pitch) - self.foot_radius, float(distance))
+            for leg, distance in zip(self.legs, ahead, strict=True)
+        ]
         over, low = max(
             max((length - leg.reach[1], False), (leg.reach[0] - length, True))
             for length, leg in zip(lengths, self.legs, strict=True)
@@ -136,13 +147,13 @@ class KeyframeReader:
         )
 
     def _check_limits(self, name: str, joint_pos: np.ndarray) -> None:
-        low, high = self.joint_range.T
+        low, high = self.joint_limits.T
         over = np.maximum(low - joint_pos, joint_pos - high)
         worst = int(np.argmax(over))
         if over[worst] > _LIMIT_SLACK:
             raise RobotError(
                 f"keyframe {name!r} of {self.robot}: {self.joint_names[worst]} at "
                 f"{joint_pos[worst]:.3f} rad is {over[worst]:.3f} rad outside its limits "
-                f"({low[worst]:.3f} to {high[worst]:.3f}): change base_height or pitch in "
-                f"{self.path}"
+                f"({low[worst]:.3f} to {high[worst]:.3f}): change base_height, pitch or feet_ahead "
+                f"in {self.path}"
             )

@@ -52,25 +52,44 @@ class Leg:
         """Return the hip's height (m) over the ground at a base height (m) and pitch (rad)."""
         return base_height - self.hip[0] * np.sin(pitch) + self.hip[2] * np.cos(pitch)
 
-    def foot_below_hip(self, length: float, pitch: float, knee_back: bool) -> tuple[float, float]:
-        """Return hip and knee angles (rad) that put the foot ``length`` m vertically below the hip.
+    def reach_foot(
+        self, below: float, ahead: float, pitch: float, knee_back: bool
+    ) -> tuple[float, float]:
+        """Return the hip and knee angles that put the foot's centre where it is asked for, rad.
 
-        The triangle hip, knee, foot gives each link's angle from the vertical (law of cosines);
-        base pitch and the links' own angles in the zero pose are taken off.
+        The triangle hip, knee, foot gives each link's angle from the line between hip and foot
+        (law of cosines); base pitch and the links' own angles in the zero pose are taken off.
+
+        Args:
+            below: Height of the hip above the foot's centre, m.
+            ahead: Distance of the foot's centre ahead of the hip, level, m.
+            pitch: Of the base, nose down positive, rad.
+            knee_back: Whether the knee lies behind that line, or else ahead of it.
 
         Raises:
             ReachError: if the triangle does not close.
         """
+        length = leg_length(below, ahead)
         a, b = self.lengths
         shortest, longest = self.reach
         if not max(shortest, _TOUCHING) <= length <= longest + _TOUCHING:
             raise ReachError(f"{length:.3f} m is outside {shortest:.3f} to {longest:.3f} m")
         length = min(length, longest)
         side = 1.0 if knee_back else -1.0
-        thigh = side * np.arccos(np.clip((length**2 + a**2 - b**2) / (2 * length * a), -1, 1))
-        shank = -side * np.arccos(np.clip((length**2 + b**2 - a**2) / (2 * length * b), -1, 1))
+        line = -np.arctan2(ahead, below)  # from the vertical, backward positive
+        thigh = line + side * np.arccos(
+            np.clip((length**2 + a**2 - b**2) / (2 * length * a), -1, 1)
+        )
+        shank = line - side * np.arccos(
+            np.clip((length**2 + b**2 - a**2) / (2 * length * b), -1, 1)
+        )
         hip_angle = thigh - pitch - _from_vertical(self.thigh)
         return hip_angle, shank - _from_vertical(self.shank) - pitch - hip_angle
+
+
+def leg_length(below: float, ahead: float) -> float:
+    """Return the distance from hip to foot in m, negative for a foot above its hip."""
+    return float(np.copysign(np.hypot(below, ahead), below))
 
 
 def find_legs(model: mujoco.MjModel, base: str, feet: tuple[str, ...]) -> tuple[Leg, ...]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import difflib
 import fnmatch
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -68,26 +68,55 @@ def number(value: object, what: str, where: str) -> float:
     return float(value)
 
 
-def per_joint(key: str, value: object, joints: tuple[str, ...], where: str) -> np.ndarray:
-    """Return one number a joint, shape (J,), from a number or from {name pattern: number}.
+def per_name(key: str, value: object, names: tuple[str, ...], where: str) -> np.ndarray:
+    """Return one number per name, shape (len(names),), from a number or {name pattern: number}.
 
     Raises:
-        RobotError: if a pattern fits no joint, or a joint has no value.
+        RobotError: if a pattern fits none of the names, or a name has no value.
     """
+    return _spread(key, value, names, where, lambda entry: [number(entry, key, where)])[:, 0]
+
+
+def ranges_per_name(key: str, value: object, names: tuple[str, ...], where: str) -> np.ndarray:
+    """Return [low, high] per name, shape (len(names), 2), from a pair or {name pattern: pair}.
+
+    Raises:
+        RobotError: as `per_name`, and where low is not below high.
+    """
+
+    def pair(entry: object) -> list[float]:
+        if not isinstance(entry, list) or len(entry) != 2:
+            raise RobotError(f"{key} must be [lowest, highest], not {entry!r}, in {where}")
+        low, high = (number(x, key, where) for x in entry)
+        if low >= high:
+            raise RobotError(f"{key}: the first of {entry} must be the lower one, in {where}")
+        return [low, high]
+
+    return _spread(key, value, names, where, pair)
+
+
+def _spread(
+    key: str,
+    value: object,
+    names: tuple[str, ...],
+    where: str,
+    read: Callable[[object], list[float]],
+) -> np.ndarray:
+    """Give every name the numbers of the last pattern that fits it, (len(names), numbers)."""
     patterns = value if isinstance(value, dict) else {"*": value}
-    values = np.full(len(joints), np.nan)
+    found: dict[str, list[float]] = {}
     for pattern, entry in patterns.items():
-        matches = fnmatch.filter(joints, pattern)
+        matches = fnmatch.filter(names, str(pattern))
         if not matches:
             raise RobotError(
-                f"{key}: {pattern!r} fits no joint of {', '.join(joints)}"
-                f"{hint(pattern, joints)} in {where}"
+                f"{key}: {pattern!r} fits none of {', '.join(names)}{hint(pattern, names)} "
+                f"in {where}"
             )
-        values[[joints.index(joint) for joint in matches]] = number(entry, key, where)
-    missing = [joint for joint, entry in zip(joints, values, strict=True) if np.isnan(entry)]
+        found |= dict.fromkeys(matches, read(entry))
+    missing = [name for name in names if name not in found]
     if missing:
         raise RobotError(f"{key} has no value for {', '.join(missing)} in {where}")
-    return frozen(values)
+    return frozen(np.array([found[name] for name in names]))
 
 
 def matching(key: str, patterns: object, names: list[str], where: str) -> tuple[str, ...]:

@@ -14,6 +14,12 @@ from kiras_rl.robots.robot import Robot, RobotError
 FOOT_TOLERANCE = 0.005
 """m; a foot within this distance of the ground counts as standing on it."""
 
+JOINT_MARGIN = 0.1
+"""rad; a keyframe stays at least this far from joint limits: its steps need room, too."""
+
+TORQUE_MARGIN = 0.2
+"""Share of the torque limit that holding a keyframe leaves."""
+
 BALANCE_TOLERANCE = 0.01
 """m; how far the centre of mass may lie outside the feet that stand."""
 
@@ -35,6 +41,12 @@ class KeyframeReport:
     """Joint torques that hold the pose. Shape (J,), N m."""
     imbalance: float
     """Distance of the centre of mass from where the feet could carry it in m."""
+
+    @property
+    def joint_margin(self) -> np.ndarray:
+        """Distance of each joint from the nearer of its limits. Shape (J,), rad."""
+        low, high = self.robot.joint_limits.T
+        return np.minimum(self.keyframe.joint_pos - low, high - self.keyframe.joint_pos)
 
     @property
     def worst_joint(self) -> int:
@@ -59,10 +71,19 @@ class KeyframeReport:
             )
         joint = self.worst_joint
         torque, limit = abs(self.torque[joint]), self.robot.torque_limit[joint]
-        if torque > limit:
+        allowed = (1.0 - TORQUE_MARGIN) * limit
+        if torque > allowed:
             return (
                 f"{place}: {self.robot.joint_names[joint]} needs {torque:.2f} N m to hold it, "
-                f"{limit:.2f} N m at most: change the pose in {path}"
+                f"{allowed:.2f} N m at most ({TORQUE_MARGIN:.0%} below its limit): "
+                f"change the pose in {path}"
+            )
+        nearest = int(np.argmin(self.joint_margin))
+        if self.joint_margin[nearest] < JOINT_MARGIN:
+            return (
+                f"{place}: {self.robot.joint_names[nearest]} is "
+                f"{self.joint_margin[nearest]:.3f} rad from its limit, {JOINT_MARGIN:g} rad at "
+                f"least: move the feet by feet_ahead or change the pose in {path}"
             )
         return None
 

@@ -64,6 +64,7 @@ def make_table(robot: Robot, reports: list[KeyframeReport]) -> Table:
     table.add_column("joint angles\nfrom hip to foot\n(rad)", no_wrap=True)
     for heading in (
         "reach\nmargin\n(mm)",
+        "joint\nmargin\n(rad)",
         "static peak\ntorque\n(N m)",
         "foot\nerror\n(mm)",
     ):
@@ -105,6 +106,7 @@ def _row(report: KeyframeReport) -> tuple[str, ...]:
         f"{np.rad2deg(keyframe.pitch):.0f}",
         _angles(report.robot, keyframe),
         f"{1e3 * report.leg_margin:.0f}",
+        f"{report.joint_margin.min():.2f}",
         _peak_torque(report),
         f"{1e3 * np.abs(report.foot_height).max():.1f}",
     )

@@ -35,8 +35,8 @@ MISTAKES = {
     ),
     "beyond a joint limit": (
         {"twist": {"base_height": 0.2, "pitch": 0, "joint_pos": [3.5, *[0.0] * 7]}},
-        r"keyframe 'twist' of solo8: FL_HFE at 3\.500 rad is 0\.358 rad outside its limits "
-        r"\(-3\.142 to 3\.142\)",
+        r"keyframe 'twist' of solo8: FL_HFE at 3\.500 rad is 2\.050 rad outside its limits "
+        r"\(-1\.450 to 1\.450\)",
     ),
     "unknown key": (
         {"walk": {"base_heigth": 0.2, "pitch": 0, "knees": "back"}},
@@ -77,7 +77,12 @@ def test_mistakes_in_keyframes(edit, name):
         ({"kp": None}, r"missing in .*robot\.yaml: kp"),
         ({"kp": "stiff"}, "kp must be a number, not 'stiff'"),
         ({"kd": {"*_HFE": 0.1}}, "kd has no value for FL_KFE, FR_KFE, HL_KFE, HR_KFE"),
-        ({"kd": {"*_HAA": 0.1}}, r"kd: '\*_HAA' fits no joint of FL_HFE, "),
+        ({"kd": {"*_HAA": 0.1}}, r"kd: '\*_HAA' fits none of FL_HFE, "),
+        ({"joint_limits": 1.0}, r"joint_limits must be \[lowest, highest\], not 1\.0"),
+        ({"joint_limits": [1.0, -1.0]}, r"first of \[1\.0, -1\.0\] must be the lower one"),
+        ({"motor": {"stall_torque": 3.0}}, "missing in motor of .*: no_load_speed"),
+        ({"motor": 3.0}, r"motor must hold stall_torque, no_load_speed, not 3\.0"),
+        ({"variants": [1]}, "variants must hold"),
         ({"joints": ["FL_KFE"]}, r"MJCF's order \[FL_HFE, FL_KFE, .*\], not \['FL_KFE'\]"),
         ({"base_body": "bas"}, r"base_body: 'bas' is not in the MJCF \(did you mean 'base'\?\)"),
         ({"foot_geoms": ["FL_fot"]}, r"'FL_fot' is not in the MJCF \(did you mean 'FL_foot'\?\)"),
@@ -109,9 +114,22 @@ def test_keyframe_that_is_too_heavy(edit):
     with pytest.raises(
         RobotError,
         match=r"keyframe 'walk' of solo8: H[LR]_KFE needs 0\.7[45] N m to hold it, "
-        r"0\.50 N m at most: change the pose in .*keyframes\.yaml",
+        r"0\.40 N m at most \(20% below its limit\): change the pose in .*keyframes\.yaml",
     ):
         check_keyframe(robot, robot.keyframe("walk"))
+
+
+def test_keyframe_that_leaves_steps_no_room(edit):
+    low = {"base_height": 0.08, "pitch": 0, "knees": "back"}
+    margin = 2.80 - 2.0 * float(np.arccos(0.064 / 0.32))
+    robot = edit("keyframes.yaml", low=low)
+    with pytest.raises(RobotError, match=rf"_KFE is {margin:.3f} rad from its limit, 0\.1 rad"):
+        check_keyframe(robot, robot.keyframe("low"))
+
+
+def test_unknown_variant(solo8):
+    with pytest.raises(RobotError, match=r"no robot 'solo8:12' \(did you mean '12A'\?\)"):
+        load_robot("solo8:12")
 
 
 def test_keyframe_that_floats(edit):

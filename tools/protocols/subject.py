@@ -214,7 +214,7 @@ class Subject:
     def _physics_digest(self) -> str:
         """A short name of robot, simulation and environment: other ones give other results."""
         contract = self.onboard.metadata.to_dict() | {"provenance": None, "version": None}
-        mjcf = (self.robot.folder / f"{self.robot.name}.xml").read_text(encoding="utf-8")
+        mjcf = self.robot.mjcf.read_text(encoding="utf-8")
         machine = {"backend": None, "threads": None}  # the first one is in the key by itself
         grounds = [(asdict(c.sim) | machine, asdict(c.env)) for c in (self.flat(), self.rough())]
         text = json.dumps([contract, mjcf, *grounds], sort_keys=True)
