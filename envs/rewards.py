@@ -2,18 +2,21 @@
 
 A term's value is positive and its weight in the YAML gives the sign; only `feet_drag` is negative,
 for the paper gives it a positive weight. The paper's table is cfg/paper.yaml.
+
+Terms of the gait judge a foot when it lands or lifts off, from what is remembered of its swing or
+stance (kiras_rl.envs.memory), and leave a robot alone that is told to stand.
 """
 
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable
 from functools import partial
 
 import torch
 
 from kiras_rl.config import ConfigError
 from kiras_rl.envs.lookup import find_function
+from kiras_rl.envs.memory import remembering
 from kiras_rl.envs.state import Step
 from kiras_rl.schema import RewardConfig
 
@@ -98,13 +101,81 @@ def foot_clearance(step: Step, height: float) -> torch.Tensor:
     return (missing * speed).sum(-1)
 
 
+def air_time(before: torch.Tensor, step: Step) -> torch.Tensor:
+    """Remember for how long each foot has been off the ground, (N, F), s."""
+    return (before + step.dt) * ~step.robot.foot_stands
+
+
+def stance_time(before: torch.Tensor, step: Step) -> torch.Tensor:
+    """Remember for how long each foot has stood, (N, F), s."""
+    return (before + step.dt) * step.robot.foot_stands
+
+
+def swing_peak(before: torch.Tensor, step: Step) -> torch.Tensor:
+    """Remember how high each foot has been in its swing, (N, F), m."""
+    return torch.maximum(before, step.robot.foot_height) * ~step.robot.foot_stands
+
+
+@remembering(air_time)
 def feet_air_time(step: Step, target: float) -> torch.Tensor:
     """Return by how much the feet that land now were in the air longer than `target`, summed, s.
 
-    Short steps cost, long ones earn; a robot that is asked to stand is left alone.
+    Short steps cost, long ones earn.
     """
-    landing = step.robot.foot_contact & (step.air_time > 0.0)
-    return ((step.air_time - target) * landing).sum(-1) * ~_standing(step)
+    return ((step.memory[air_time] - target) * _landing(step)).sum(-1) * ~_standing(step)
+
+
+@remembering(air_time)
+def short_swing(step: Step, least: float) -> torch.Tensor:
+    """Return the sum over feet that land of the share of `least` s that their swing lacks."""
+    lacking = (1.0 - step.memory[air_time] / least).clamp(min=0.0)
+    return (lacking * _landing(step)).sum(-1) * ~_standing(step)
+
+
+@remembering(stance_time)
+def short_stance(step: Step, least: float) -> torch.Tensor:
+    """Return the sum over feet that lift off of the share of `least` s that their stance lacks."""
+    stood = step.memory[stance_time]
+    lifting = ~step.robot.foot_stands & (stood > 0.0)
+    return ((1.0 - stood / least).clamp(min=0.0) * lifting).sum(-1) * ~_standing(step)
+
+
+@remembering(air_time, swing_peak)
+def low_swing(step: Step, height: float, share: float) -> torch.Tensor:
+    """Return the sum over feet that land of the squared share of the height that they lacked.
+
+    Args:
+        step: The step.
+        height: That a swing should reach, m.
+        share: Of the keyframe's base height; a lower robot lifts its feet less.
+    """
+    wanted = (share * step.keyframes.height[step.task.skill]).clamp(max=height)[:, None]
+    lacking = (1.0 - step.memory[swing_peak] / wanted).clamp(min=0.0).square()
+    return (lacking * _landing(step)).sum(-1) * ~_standing(step)
+
+
+@remembering(stance_time)
+def idle_feet(step: Step, most: float) -> torch.Tensor:
+    """Return the number of feet that have stood for longer than `most` s."""
+    return (step.memory[stance_time] > most).float().sum(-1) * ~_standing(step)
+
+
+def flight(step: Step, feet: float) -> torch.Tensor:
+    """Return how many feet fewer than `feet` are on the ground."""
+    standing = step.robot.foot_stands.float().sum(-1)
+    return (feet - standing).clamp(min=0.0) * ~_standing(step)
+
+
+def joint_limits(step: Step, margin: float) -> torch.Tensor:
+    """Return how far joints and targets are outside limits that are `margin` narrower, rad."""
+    joints, targets = step.robot.joint_pos, step.target
+    return (step.limits.beyond(joints, margin) + step.limits.beyond(targets, margin)).sum(-1)
+
+
+def torque_limits(step: Step, share: float) -> torch.Tensor:
+    """Return the sum of torques beyond a `share` of their limits, in limits."""
+    used = step.robot.peak_torque / step.limits.torque
+    return (used - share).clamp(min=0.0).sum(-1)
 
 
 def feet_drag(step: Step) -> torch.Tensor:
@@ -151,6 +222,11 @@ def termination(step: Step) -> torch.Tensor:
     return step.fallen.float()
 
 
+def _landing(step: Step) -> torch.Tensor:
+    """Return the feet that stand and did not before, (N, F) bool."""
+    return step.robot.foot_stands & (step.memory[air_time] > 0.0)
+
+
 def _standing(step: Step) -> torch.Tensor:
     return torch.linalg.vector_norm(step.task.command, dim=-1) < STANDING
 
@@ -159,7 +235,7 @@ class RewardSum:
     """The weighted sum of the configured terms."""
 
     def __init__(self, config: RewardConfig, step_dt: float, device: torch.device) -> None:
-        """Look the terms up.
+        """Look the terms up; `functions` are those without their parameters.
 
         Raises:
             ConfigError: Unknown term or parameter, or a parameter that is no number.
@@ -173,6 +249,7 @@ class RewardSum:
         self.names = list(terms)
         self.is_termination = torch.tensor([n == "termination" for n in terms], device=device)
         self._terms = [_bind(name, values) for name, values in terms.items()]
+        self.functions = [term.func for term in self._terms]
         scale = step_dt if config.scale_by_dt else 1.0
         weights = [float(values["weight"]) * scale for values in terms.values()]
         self._weights = torch.tensor(weights, device=device)
@@ -182,7 +259,7 @@ class RewardSum:
         return torch.stack([term(step) for term in self._terms], dim=1) * self._weights
 
 
-def _bind(name: str, values: dict) -> Callable[[Step], torch.Tensor]:
+def _bind(name: str, values: dict) -> partial[torch.Tensor]:
     function = find_function(globals(), name, Step, where="env.rewards.terms")
     parameters = {key: value for key, value in values.items() if key != "weight"}
     signature = inspect.signature(function)

@@ -86,8 +86,16 @@ class RandomizationConfig:
     com_shift: tuple[float, float] | None
     kp_factor: tuple[float, float] | None
     kd_factor: tuple[float, float] | None
+    motor_factor: tuple[float, float] | None
     torque_factor: tuple[float, float] | None
+    leg_mass_factor: tuple[float, float] | None
+    joint_friction_factor: tuple[float, float] | None
+    joint_damping_factor: tuple[float, float] | None
+    encoder_bias: tuple[float, float] | None
+    imu_tilt: tuple[float, float] | None
+    gyro_bias: tuple[float, float] | None
     action_delay: tuple[int, int] | None
+    observation_delay: tuple[int, int] | None
     push_velocity: tuple[float, float] | None
     push_interval: float
 
