@@ -40,7 +40,9 @@ def remembering(*updates: Update) -> Callable[[Callable], Callable]:
 class Memory:
     """The memories that some terms ask for, as one attribute each; see the module."""
 
-    def __init__(self, terms: Iterable[Callable], num_worlds: int, feet: int, device: torch.device):
+    def __init__(
+        self, terms: Iterable[Callable], num_worlds: int, feet: int, device: torch.device
+    ) -> None:
         """Begin with zeros; a memory that several terms read is kept once."""
         wanted = [update for term in terms for update in getattr(term, "memories", ())]
         self._updates = {update.__name__: update for update in wanted}

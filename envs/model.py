@@ -26,9 +26,9 @@ class SensorLayout:
         base_force_w: The same for the geoms of the base, B * 3, N.
         limb_force_w: The same for the penalised geoms, L * 3, N.
         joint_torque: Actuator torques, J, N m.
-        motion: Orientation of the base (w, x, y, z), 4, its angular velocity in the base frame, 3,
-            rad/s, joint angles, J, rad, and joint velocities, J, rad/s; None where no observation
-            is late.
+        motion: Orientation of the base (w, x, y, z), its angular velocity in the base frame,
+            rad/s, joint angles, rad, and joint velocities, rad/s, 7 + 2 J; None where no
+            observation is late.
     """
 
     foot_vel_w: slice
@@ -36,7 +36,7 @@ class SensorLayout:
     base_force_w: slice
     limb_force_w: slice
     joint_torque: slice
-    motion: tuple[slice, slice, slice, slice] | None = None
+    motion: slice | None = None
 
     @property
     def forces_w(self) -> slice:
@@ -102,7 +102,7 @@ def build_scene(
         model=model,
         sensors=SensorLayout(
             **{key: _span(model, value) for key, value in names.items()},
-            motion=tuple(_span(model, value) for value in motion) or None,
+            motion=_span(model, motion) if motion else None,
         ),
         base_body=model.body(robot.base_body).id,
         robot_geoms=[i for i in range(model.ngeom) if model.geom_priority[i] > 0],
@@ -134,25 +134,23 @@ def _add_sensors(spec: mujoco.MjSpec, robot: Robot) -> dict[str, list[str]]:
     }
 
 
-def _add_motion_sensors(spec: mujoco.MjSpec, robot: Robot) -> list[list[str]]:
-    """Add sensors of what the robot's own sensors read; return their names by quantity.
+def _add_motion_sensors(spec: mujoco.MjSpec, robot: Robot) -> list[str]:
+    """Add sensors of what the robot's own sensors read; return their names in order.
 
-    Of the base frame and not of an IMU's site: errors of the IMU belong to each world.
+    They sit in the base frame, not at an IMU's site: errors of the IMU belong to each world.
     """
 
-    def add(kind: mujoco.mjtSensor, objtype: mujoco.mjtObj, name: str, **of: object) -> str:
+    def add(kind: mujoco.mjtSensor, objtype: mujoco.mjtObj, name: str) -> str:
         sensor = spec.add_sensor(name=f"{kind.name}/{name}", type=kind)
         sensor.objtype, sensor.objname = objtype, name
-        for key, value in of.items():
-            setattr(sensor, key, value)
         return sensor.name
 
-    base, body = robot.base_body, _OBJ.mjOBJ_XBODY
+    base = spec.body(robot.base_body).add_site(name="motion/base").name
     return [
-        [add(_SENSOR.mjSENS_FRAMEQUAT, body, base)],
-        [add(_SENSOR.mjSENS_FRAMEANGVEL, body, base, reftype=body, refname=base)],
-        [add(_SENSOR.mjSENS_JOINTPOS, _OBJ.mjOBJ_JOINT, joint) for joint in robot.joint_names],
-        [add(_SENSOR.mjSENS_JOINTVEL, _OBJ.mjOBJ_JOINT, joint) for joint in robot.joint_names],
+        add(_SENSOR.mjSENS_FRAMEQUAT, _OBJ.mjOBJ_SITE, base),
+        add(_SENSOR.mjSENS_GYRO, _OBJ.mjOBJ_SITE, base),
+        *(add(_SENSOR.mjSENS_JOINTPOS, _OBJ.mjOBJ_JOINT, joint) for joint in robot.joint_names),
+        *(add(_SENSOR.mjSENS_JOINTVEL, _OBJ.mjOBJ_JOINT, joint) for joint in robot.joint_names),
     ]
 
 

@@ -10,7 +10,7 @@ import torch
 from tensordict import TensorDict
 
 from kiras_rl import interfaces as names
-from kiras_rl.envs import commands, curriculum, randomization, sensing, terminations
+from kiras_rl.envs import commands, curriculum, randomization, terminations
 from kiras_rl.envs.commands import TaskSampler
 from kiras_rl.envs.curriculum import Curriculum
 from kiras_rl.envs.description import describe_deployment
@@ -27,7 +27,7 @@ from kiras_rl.envs.randomness import UniformBuffer
 from kiras_rl.envs.rewards import RewardSum
 from kiras_rl.envs.sensing import Sensors
 from kiras_rl.envs.simulation.build import make_simulation
-from kiras_rl.envs.state import Keyframes, Limits, RobotState, Step, Task
+from kiras_rl.envs.state import STANDING, Keyframes, Limits, RobotState, Step, Task
 from kiras_rl.envs.terrain_library import build_library
 from kiras_rl.envs.terrains import CROSSED
 from kiras_rl.interfaces import Measurements, SkillEnv
@@ -73,6 +73,7 @@ class QuadrupedEnv(SkillEnv):
         self.keyframes = Keyframes.of(robot, device)
         self.keyframe_height, self.keyframe_pitch = self.keyframes.height, self.keyframes.pitch
         self.keyframe_joint_pos = self.keyframes.joint_pos
+        self.keyframe_clearance = self.keyframes.clearance
         self._limits = Limits.of(robot, device)
         self.mass = float(self.scene.model.body_subtreemass[self.scene.base_body])
         self._ground = None
@@ -147,7 +148,7 @@ class QuadrupedEnv(SkillEnv):
         names = [*_BUFFERS, "_last_action", *(f"task.{name}" for name in vars(self.task))]
         slots: list[tuple[object, str]] = [(self, name) for name in names]
         slots += [(self._memory, name) for name in self._memory.names]
-        slots += [(self._sensors, name) for name in sensing.STATE]
+        slots += [(self._sensors, "errors")]
         slots += [(self._tasks, "probabilities")]
         slots += [(self._observer, name) for name in ("clean", "features", "_frame", "_history")]
         if self._curriculum:
@@ -218,7 +219,7 @@ class QuadrupedEnv(SkillEnv):
             names.NEXT_PROPRIO: _unless(invalid, observer.proprio(view), observer.clean),
             "log": self._log(terms, fallen, time_outs),
         }
-        self._measurements = measure(self.robot, distance, fallen | invalid)
+        self._measurements = measure(self.robot, self._limits, distance, fallen | invalid)
 
         done = fallen | time_outs
         if self._curriculum:
@@ -237,7 +238,9 @@ class QuadrupedEnv(SkillEnv):
 
         A world whose physics broke has no meaningful terms; it earns nothing but the termination.
         """
+        command = self.task.command
         step = Step(
+            stands=torch.linalg.vector_norm(command, dim=-1) < STANDING,
             robot=self.robot,
             task=self.task,
             keyframes=self.keyframes,

@@ -20,8 +20,6 @@ from kiras_rl.envs.memory import remembering
 from kiras_rl.envs.state import Step
 from kiras_rl.schema import RewardConfig
 
-STANDING = 0.1  # m/s or rad/s; a smaller command asks to stand
-
 
 def tracking_lin_vel(step: Step, sigma: float, lateral: float = 0.0) -> torch.Tensor:
     """Return exp(-error^2 / sigma) of the horizontal velocity; `lateral` weighs the y error."""
@@ -122,14 +120,14 @@ def feet_air_time(step: Step, target: float) -> torch.Tensor:
 
     Short steps cost, long ones earn.
     """
-    return ((step.memory[air_time] - target) * _landing(step)).sum(-1) * ~_standing(step)
+    return ((step.memory[air_time] - target) * _landing(step)).sum(-1) * ~step.stands
 
 
 @remembering(air_time)
 def short_swing(step: Step, least: float) -> torch.Tensor:
     """Return the sum over feet that land of the share of `least` s that their swing lacks."""
     lacking = (1.0 - step.memory[air_time] / least).clamp(min=0.0)
-    return (lacking * _landing(step)).sum(-1) * ~_standing(step)
+    return (lacking * _landing(step)).sum(-1) * ~step.stands
 
 
 @remembering(stance_time)
@@ -137,39 +135,38 @@ def short_stance(step: Step, least: float) -> torch.Tensor:
     """Return the sum over feet that lift off of the share of `least` s that their stance lacks."""
     stood = step.memory[stance_time]
     lifting = ~step.robot.foot_stands & (stood > 0.0)
-    return ((1.0 - stood / least).clamp(min=0.0) * lifting).sum(-1) * ~_standing(step)
+    return ((1.0 - stood / least).clamp(min=0.0) * lifting).sum(-1) * ~step.stands
 
 
 @remembering(air_time, swing_peak)
-def low_swing(step: Step, height: float, share: float) -> torch.Tensor:
+def low_swing(step: Step, factor: float) -> torch.Tensor:
     """Return the sum over feet that land of the squared share of the height that they lacked.
 
     Args:
         step: The step.
-        height: That a swing should reach, m.
-        share: Of the keyframe's base height; a lower robot lifts its feet less.
+        factor: Of the clearance that steps of the skill should have.
     """
-    wanted = (share * step.keyframes.height[step.task.skill]).clamp(max=height)[:, None]
+    wanted = (factor * step.keyframes.clearance[step.task.skill])[:, None]
     lacking = (1.0 - step.memory[swing_peak] / wanted).clamp(min=0.0).square()
-    return (lacking * _landing(step)).sum(-1) * ~_standing(step)
+    return (lacking * _landing(step)).sum(-1) * ~step.stands
 
 
 @remembering(stance_time)
 def idle_feet(step: Step, most: float) -> torch.Tensor:
     """Return the number of feet that have stood for longer than `most` s."""
-    return (step.memory[stance_time] > most).float().sum(-1) * ~_standing(step)
+    return (step.memory[stance_time] > most).float().sum(-1) * ~step.stands
 
 
 def flight(step: Step, feet: float) -> torch.Tensor:
     """Return how many feet fewer than `feet` are on the ground."""
     standing = step.robot.foot_stands.float().sum(-1)
-    return (feet - standing).clamp(min=0.0) * ~_standing(step)
+    return (feet - standing).clamp(min=0.0) * ~step.stands
 
 
 def joint_limits(step: Step, margin: float) -> torch.Tensor:
     """Return how far joints and targets are outside limits that are `margin` narrower, rad."""
-    joints, targets = step.robot.joint_pos, step.target
-    return (step.limits.beyond(joints, margin) + step.limits.beyond(targets, margin)).sum(-1)
+    angles = torch.cat([step.robot.joint_pos[:, None], step.target[:, None]], dim=1)
+    return step.limits.beyond(angles, margin).sum(dim=(1, 2))
 
 
 def torque_limits(step: Step, share: float) -> torch.Tensor:
@@ -196,13 +193,13 @@ def collision(step: Step, threshold: float) -> torch.Tensor:
 
 def stand_still(step: Step) -> torch.Tensor:
     """Return the sum of absolute joint velocities when asked to stand, rad/s."""
-    return torch.where(_standing(step), step.robot.joint_vel.abs().sum(-1), 0.0)
+    return torch.where(step.stands, step.robot.joint_vel.abs().sum(-1), 0.0)
 
 
 def stand_still_pose(step: Step) -> torch.Tensor:
     """Return the sum of |q - keyframe| when asked to stand, rad."""
     error = (step.robot.joint_pos - step.keyframes.joint_pos[step.task.skill]).abs().sum(-1)
-    return torch.where(_standing(step), error, 0.0)
+    return torch.where(step.stands, error, 0.0)
 
 
 def skill_height(step: Step, sigma: float) -> torch.Tensor:
@@ -225,10 +222,6 @@ def termination(step: Step) -> torch.Tensor:
 def _landing(step: Step) -> torch.Tensor:
     """Return the feet that stand and did not before, (N, F) bool."""
     return step.robot.foot_stands & (step.memory[air_time] > 0.0)
-
-
-def _standing(step: Step) -> torch.Tensor:
-    return torch.linalg.vector_norm(step.task.command, dim=-1) < STANDING
 
 
 class RewardSum:

@@ -9,7 +9,7 @@ from torch.nn.functional import normalize
 
 from kiras_rl.envs import rotations
 from kiras_rl.envs.model import SensorLayout
-from kiras_rl.envs.randomness import UniformBuffer, scale_to
+from kiras_rl.envs.randomness import UniformBuffer
 from kiras_rl.envs.simulation.base import Simulation
 from kiras_rl.envs.state import RobotState
 from kiras_rl.schema import RandomizationConfig
@@ -41,10 +41,9 @@ class Sensors:
     """The sensors of N robots; their errors are drawn at a reset and stay for the episode.
 
     Attributes:
-        encoder_bias: What encoders read at angle 0, (N, J), rad.
-        imu_tilt: Small rotation from the base to the IMU, (N, 3), rad; none about the vertical.
-        gyro_bias: (N, 3), rad/s.
-        delay: Age of what is read, (N,) int64, physics steps.
+        errors: One row per world, (N, E): biases of the encoders, J, rad; rotation from the base
+            to the IMU, 3, rad, small and none about the vertical; biases of the gyroscope, 3,
+            rad/s; age of what is read, 1, physics steps and a fraction that does not count.
     """
 
     def __init__(
@@ -56,83 +55,69 @@ class Sensors:
     ) -> None:
         """Begin with sensors that make no error."""
         self._config, self._sim, self._layout, self._random = config, sim, layout, random
-        n, joints, device = sim.num_worlds, sim.model.nu, sim.device
-        self.encoder_bias = torch.zeros(n, joints, device=device)
-        self.imu_tilt = torch.zeros(n, 3, device=device)
-        self.gyro_bias = torch.zeros(n, 3, device=device)
-        self.delay = torch.zeros(n, dtype=torch.int64, device=device)
-        imu = config.imu_tilt or config.gyro_bias
-        self.are_exact = not (config.encoder_bias or imu or config.observation_delay)
+        joints, none = sim.model.nu, (0.0, 0.0)
+        delay = config.observation_delay
+        tilt = config.imu_tilt or none
+        ranges = [
+            *[config.encoder_bias or none] * joints,
+            *(tilt, tilt, none),
+            *[config.gyro_bias or none] * 3,
+            (delay[0], delay[1] + 1) if delay else none,
+        ]
+        self.are_exact = not any(low or high for low, high in ranges)
+        self._low, high = torch.tensor(ranges, dtype=torch.float32, device=sim.device).T
+        self._span = high - self._low
+        self.errors = torch.zeros(sim.num_worlds, len(ranges), device=sim.device)
 
     @staticmethod
     def columns(num_joints: int) -> dict[str, int]:
         """Return the random numbers that this class takes each step."""
-        return {"encoder_bias": num_joints, "imu_tilt": 2, "gyro_bias": 3, "observation_delay": 1}
+        return {"sensors": num_joints + 7}
+
+    @property
+    def encoder_bias(self) -> torch.Tensor:
+        """What encoders read at angle 0, (N, J), rad."""
+        return self.errors[:, :-7]
 
     def reset(self, worlds: torch.Tensor) -> None:
         """Draw the errors of some worlds, (N,) bool."""
-        config, random = self._config, self._random
-        if config.encoder_bias:
-            drawn = scale_to(random["encoder_bias"], *config.encoder_bias)
-            self.encoder_bias = torch.where(worlds[:, None], drawn, self.encoder_bias)
-        if config.imu_tilt:
-            drawn = scale_to(random["imu_tilt"], *config.imu_tilt)
-            tilt = torch.cat([drawn, torch.zeros_like(drawn[:, :1])], dim=1)
-            self.imu_tilt = torch.where(worlds[:, None], tilt, self.imu_tilt)
-        if config.gyro_bias:
-            drawn = scale_to(random["gyro_bias"], *config.gyro_bias)
-            self.gyro_bias = torch.where(worlds[:, None], drawn, self.gyro_bias)
-        if config.observation_delay:
-            low, high = config.observation_delay
-            drawn = scale_to(random["observation_delay"][:, 0], low, high + 1).long()
-            self.delay = torch.where(worlds, drawn, self.delay)
+        if not self.are_exact:
+            drawn = self._low + self._span * self._random["sensors"]
+            self.errors = torch.where(worlds[:, None], drawn, self.errors)
 
-    def read(self, robot: RobotState, begun: torch.Tensor) -> Sensed | RobotState:
+    def read(self, robot: RobotState, begun: torch.Tensor) -> Sensed:
         """Return what is read now.
 
         Args:
             robot: The robots.
             begun: Worlds that have just begun, (N,) bool: they have no past to read.
         """
-        if self.are_exact:
-            return robot
-        now = Sensed(robot.gravity_b, robot.base_ang_vel_b, robot.joint_pos, robot.joint_vel)
-        if self._config.observation_delay:
-            now = self._past(now, begun)
-        # Both vectors turn by minus the tilt, of which only the first order counts.
-        gravity = now.gravity_b + torch.linalg.cross(now.gravity_b, self.imu_tilt)
-        rates = now.base_ang_vel_b + torch.linalg.cross(now.base_ang_vel_b, self.imu_tilt)
-        return Sensed(
-            gravity_b=normalize(gravity, dim=1),
-            base_ang_vel_b=rates + self.gyro_bias,
-            joint_pos=now.joint_pos + self.encoder_bias,
-            joint_vel=now.joint_vel,
-        )
-
-    def _past(self, now: Sensed, begun: torch.Tensor) -> Sensed:
-        """Return each world's motion `delay` physics steps ago, from the record of the step."""
-        record, layout = self._sim.sensor_record, self._layout
-        late = (self.delay > 0) & ~begun
-        row = (record.shape[1] - self.delay).clamp(max=record.shape[1] - 1)
-        past = record[torch.arange(len(row), device=row.device), row]
-        quat, rates, pos, vel = (past[:, part] for part in layout.motion)
+        quat, rates, joint_pos, joint_vel = self._motion(robot, begun)
         gravity = rotations.projected_gravity(rotations.matrix(quat))
-        return Sensed(
-            *(
-                torch.where(late[:, None], old, new)
-                for old, new in zip((gravity, rates, pos, vel), vars(now).values(), strict=True)
-            )
-        )
+        tilt, gyro_bias = self.errors[:, -7:-4], self.errors[:, -4:-1]
+        # Both vectors turn by minus the tilt, of which only the first order counts.
+        gravity = normalize(gravity + torch.linalg.cross(gravity, tilt), dim=1)
+        rates = rates + torch.linalg.cross(rates, tilt) + gyro_bias
+        return Sensed(gravity, rates, joint_pos + self.encoder_bias, joint_vel)
+
+    def _motion(self, robot: RobotState, begun: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        """Return quaternion, rates, joint angles and velocities as old as each world's sensors."""
+        now = (robot.base_quat_w, robot.base_ang_vel_b, robot.joint_pos, robot.joint_vel)
+        if not self._config.observation_delay:
+            return now
+        record = self._sim.sensor_record  # its last row is a physics step older than now
+        steps = record.shape[1]
+        age = self.errors[:, -1].long()
+        row = (steps - age).clamp(max=steps - 1)
+        past = record[torch.arange(len(row), device=row.device), row]
+        late = (age > 0) & ~begun
+        motion = torch.where(late[:, None], past[:, self._layout.motion], torch.cat(now, dim=1))
+        return motion.split([part.shape[1] for part in now], dim=1)
 
     def state_dict(self) -> dict[str, torch.Tensor]:
         """Return the errors of the running episodes."""
-        return {name: getattr(self, name) for name in STATE}
+        return {"errors": self.errors}
 
     def load_state_dict(self, state: dict[str, torch.Tensor]) -> None:
         """Go on from a saved state."""
-        for name in STATE:
-            setattr(self, name, state[name].to(self.delay.device))
-
-
-STATE = ("encoder_bias", "imu_tilt", "gyro_bias", "delay")
-"""Attributes that a reset replaces."""
+        self.errors = state["errors"].to(self.errors.device)

@@ -18,6 +18,8 @@ from kiras_rl.envs.model import SensorLayout
 from kiras_rl.envs.simulation.base import Simulation
 from kiras_rl.robots.robot import Robot
 
+STANDING = 0.1  # m/s or rad/s; a smaller command asks to stand
+AT_LIMIT = 0.999  # of a torque's limit; the rest is rounding
 CONTACT_FORCE = 1.0  # N; a foot that presses harder than this stands
 PATCH_SPACING = 0.1  # m between the points whose mean is the ground under the base
 SCAN_SHAPE = (9, 7)  # points of the height scan, forward and to the left [paper: 63]
@@ -160,8 +162,16 @@ class RobotState:
         last = record[:, -1]
         self.foot_vel_w = last[:, layout.foot_vel_w].unflatten(1, (-1, 3))  # (N, F, 3), m/s
         self.joint_torque = last[:, layout.joint_torque]  # (N, J), N m
-        # Largest of the physics steps, (N, J), N m
-        self.peak_torque = record[:, :, layout.joint_torque].abs().amax(dim=1)
+        self._torques = record[:, :, layout.joint_torque].abs()  # (N, K, J), N m
+        self.peak_torque = self._torques.amax(dim=1)  # of the physics steps, (N, J), N m
+
+    def saturation(self, limit: torch.Tensor) -> torch.Tensor:
+        """Return the share of the physics steps in which a torque is at its limit, (N,).
+
+        Args:
+            limit: (J,), N m.
+        """
+        return (self._torques >= AT_LIMIT * limit).any(dim=2).float().mean(dim=1)
 
 
 @dataclass
@@ -195,6 +205,7 @@ class Keyframes:
 
     Attributes:
         height: Base height, (S,), m.
+        clearance: Height that a foot should clear in a step, (S,), m.
         pitch: Nose down positive, (S,), rad.
         joint_pos: (S, J), rad.
         gravity_b: Projected gravity, (S, 3).
@@ -202,6 +213,7 @@ class Keyframes:
     """
 
     height: torch.Tensor
+    clearance: torch.Tensor
     pitch: torch.Tensor
     joint_pos: torch.Tensor
     gravity_b: torch.Tensor
@@ -218,6 +230,7 @@ class Keyframes:
         zero = torch.zeros_like(pitch)
         return cls(
             height=tensor([k.base_height for k in robot.keyframes]),
+            clearance=tensor(robot.clearance.tolist()),
             pitch=pitch,
             joint_pos=tensor([list(k.joint_pos) for k in robot.keyframes]),
             gravity_b=torch.stack([torch.sin(pitch), zero, -torch.cos(pitch)], dim=-1),
@@ -250,8 +263,7 @@ class Limits:
 
     def beyond(self, joint_pos: torch.Tensor, margin: float = 0.0) -> torch.Tensor:
         """Return how far angles (..., J) are outside limits that are `margin` narrower, rad."""
-        over = torch.maximum(self.low + margin - joint_pos, joint_pos - self.high + margin)
-        return over.clamp(min=0.0)
+        return (joint_pos - joint_pos.clamp(self.low + margin, self.high - margin)).abs()
 
 
 @dataclass
@@ -260,6 +272,7 @@ class Step:
 
     Attributes:
         robot: The robots after the step.
+        stands: Worlds that are told to stand, (N,) bool.
         task: Their tasks.
         keyframes: The skills.
         limits: Of joints and motors.
@@ -277,6 +290,7 @@ class Step:
     """
 
     robot: RobotState
+    stands: torch.Tensor
     task: Task
     keyframes: Keyframes
     limits: Limits

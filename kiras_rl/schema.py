@@ -79,7 +79,7 @@ class TerminationConfig:
 
 @dataclass
 class RandomizationConfig:
-    """Domain randomization; null leaves the nominal value."""
+    """Domain randomization: ranges [low, high]; null leaves the nominal value."""
 
     friction: tuple[float, float] | None
     payload: tuple[float, float] | None

@@ -11,6 +11,17 @@ from tape import Tape
 torch.set_num_threads(2)  # what CI has: the same order of sums, hence the same bits, on any machine
 
 
+@pytest.fixture(scope="session")
+def nominal():
+    """Return the overrides that leave nothing of the physics and the sensors random."""
+    from dataclasses import fields
+
+    from kiras_rl.schema import RandomizationConfig
+
+    kinds = [field.name for field in fields(RandomizationConfig)]
+    return tuple(f"env.randomization.{kind}=null" for kind in kinds if kind != "push_interval")
+
+
 @pytest.fixture(scope="session", autouse=True)
 def elsewhere(tmp_path_factory):
     """Run outside the checkout: MuJoCo drops its log there, and no path may count on the folder."""

@@ -101,8 +101,8 @@ def test_a_term_that_cannot_be_is_refused(build_env, override, message):
 # --- noise and history ---------------------------------------------------------------------------
 
 
-def test_noise_stays_within_its_bounds_and_fills_them(build_env):
-    env = build_env()
+def test_noise_stays_within_its_bounds_and_fills_them(build_env, nominal):
+    env = build_env(*nominal)
     noise = torch.cat(
         [obs[PROPRIO] - clean(env, obs) for obs, *_ in random_steps(env, 60)]
     ).abs()  # fmt: skip
@@ -113,8 +113,8 @@ def test_noise_stays_within_its_bounds_and_fills_them(build_env):
         assert (largest >= 0.9 * bound.get(name, 0.0)).all()
 
 
-def test_without_noise_the_robot_sees_what_the_critic_sees(build_env):
-    env = build_env("env.observations.noise=false")
+def test_without_noise_and_errors_the_robot_sees_what_the_critic_sees(build_env, nominal):
+    env = build_env("env.observations.noise=false", *nominal)
     for obs, *_ in random_steps(env, 3):
         assert torch.equal(obs[PROPRIO], clean(env, obs))
 

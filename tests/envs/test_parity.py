@@ -15,18 +15,11 @@ import torch
 
 from kiras_rl.config import load_config
 from kiras_rl.envs import make_env, model
-from kiras_rl.envs.randomization import COLUMNS, Randomizer
+from kiras_rl.envs.randomization import Randomizer, columns
+from kiras_rl.schema import RandomizationConfig
 
 TOLERANCES = {"qpos": 1e-5, "qvel": 6e-4, "foot_vel_w": 1e-4, "record": 4e-3}
-NOTHING = {
-    "friction": None,
-    "payload": None,
-    "com_shift": None,
-    "kp_factor": None,
-    "kd_factor": None,
-    "action_delay": None,
-    "push_velocity": None,
-}
+NOTHING = {field.name: None for field in dataclasses.fields(RandomizationConfig)}
 
 
 @pytest.fixture(params=["warp", pytest.param("cuda", marks=pytest.mark.gpu)])
@@ -57,7 +50,7 @@ def randomize(sim, drill, **ranges):
     """Draw new physics as the environment does, the same for every backend."""
     config = dataclasses.replace(load_config("solo8").env.randomization, **ranges)
     generator = torch.Generator().manual_seed(5)  # of the CPU: a GPU would draw other numbers
-    random = {name: torch.rand(4, k, generator=generator) for name, k in COLUMNS.items()}
+    random = {name: torch.rand(4, k, generator=generator) for name, k in columns(8).items()}
     random = {name: x.to(sim.device) for name, x in random.items()}
     Randomizer(config, drill.scene, sim, random).reset(drill.mask(sim, range(4)))
 

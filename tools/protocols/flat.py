@@ -5,10 +5,13 @@ from __future__ import annotations
 import math
 from dataclasses import asdict
 
-from kiras_rl.evaluation.flat import FLOOR, SkillResult, evaluate_skills
+from kiras_rl.evaluation.flat import FLOOR, TARGET, Goal, SkillResult, evaluate_skills
 from kiras_rl.tools.protocols.rows import skill_table
 from kiras_rl.tools.protocols.subject import Subject
 from kiras_rl.tools.report.content import Cell, Column, Section, Table
+
+GOALS = {"target": TARGET, "floor": FLOOR}
+"""What a table calls reached, the best first."""
 
 TITLE = "Flat ground"
 TEXT = (
@@ -18,9 +21,6 @@ TEXT = (
     "step."
 )
 
-TARGET = {"height": 0.01, "pitch": math.radians(2.0), "velocity": 0.08, "falls": 0.0}
-"""What a skill should reach: m, rad, m/s, share of robots."""
-
 COLUMNS = (
     Column("height", "cm", "{:.1f}"),
     Column("error", "cm", "{:.1f}", best="low"),
@@ -28,7 +28,12 @@ COLUMNS = (
     Column("error", "deg", "{:.1f}", best="low"),
     Column("v_x", "m/s", "{:+.2f}"),
     Column("error", "m/s", "{:.2f}", best="low"),
-    Column("lifts", "1/s", "{:.1f}"),
+    Column("lifts", "1/s"),
+    Column("clear", "%", "{:.0f}"),
+    Column("duty", "%", "{:.0f}"),
+    Column("beyond", "%", "{:.1f}", best="low"),
+    Column("motor", "%", "{:.1f}", best="low"),
+    Column("power", "W", "{:.1f}", best="low"),
     Column("falls", "%", "{:.0f}", best="low"),
     Column("reached"),
 )
@@ -62,8 +67,7 @@ def table(results: dict[str, dict[str, dict]], title: str = "Skills on flat grou
 
 def _cells(values: dict) -> tuple[Cell, ...]:
     result = SkillResult(**values)
-    limits = {"target": TARGET, "floor": FLOOR}
-    reached = next((name for name in limits if result.meets(**limits[name])), "neither")
+    reached = next((name for name, goal in GOALS.items() if result.meets(goal)), "neither")
     return (
         100 * result.height,
         100 * result.height_error,
@@ -71,20 +75,25 @@ def _cells(values: dict) -> tuple[Cell, ...]:
         math.degrees(result.pitch_error),
         result.velocity,
         result.velocity_error,
-        result.lifts,
+        f"{result.lifts:.1f}-{result.most_lifts:.1f}",
+        100 * result.clearance,
+        100 * result.duty,
+        100 * result.beyond,
+        100 * result.saturated,
+        result.power,
         100 * result.falls,
         reached,
     )
 
 
 def _limits() -> str:
-    def words(limits: dict[str, float]) -> str:
+    def words(goal: Goal) -> str:
         return (
-            f"{100 * limits['height']:.0f} cm, {math.degrees(limits['pitch']):.0f} degrees, "
-            f"{limits['velocity']:.2f} m/s, {100 * limits['falls']:.0f} % falls"
+            f"errors of at most {100 * goal.height:.0f} cm, {math.degrees(goal.pitch):.0f} "
+            f"degrees, {goal.velocity:.2f} m/s, {100 * goal.falls:.0f} % falls; "
+            f"{goal.lifts[0]:g} to {goal.lifts[1]:g} lifts per second of every foot, "
+            f"{100 * goal.clearance:.0f} % of the robot's own step height; joints beyond their "
+            f"limits in {100 * goal.beyond:g} %, a motor at its limit in {100 * goal.saturated:g} %"
         )
 
-    return (
-        f"Floor: errors of at most {words(FLOOR)}, and every foot lifts once a second; "
-        f"target: {words(TARGET)}."
-    )
+    return f"Floor: {words(FLOOR)}. Target: {words(TARGET)}."

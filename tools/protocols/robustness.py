@@ -18,8 +18,8 @@ TEXT = (
     "Every skill walks straight ahead for 10 s on flat ground while one disturbance is set to a "
     "value and all others are drawn as in training. Pushes come about every 5 s, each axis up to "
     "the value. A robot succeeds if it does not fall and its "
-    f"errors stay at the floor's: {100 * FLOOR['height']:.0f} cm, "
-    f"{math.degrees(FLOOR['pitch']):.0f} degrees, {FLOOR['velocity']:.2f} m/s."
+    f"errors stay at the floor's: {100 * FLOOR.height:.0f} cm, "
+    f"{math.degrees(FLOOR.pitch):.0f} degrees, {FLOOR.velocity:.2f} m/s."
 )
 
 DURATION = 10.0  # s
@@ -112,7 +112,7 @@ def measure(subject: Subject) -> dict:
         stands = robots["falls"] == 0
         keeps = stands.clone()
         for name in ("height", "pitch", "velocity"):
-            keeps &= robots[f"{name}_error"] <= FLOOR[name]
+            keeps &= robots[f"{name}_error"] <= getattr(FLOOR, name)
         return {
             skill: {
                 "success": keeps[recording.skill == i].float().mean().item(),
