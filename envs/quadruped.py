@@ -74,7 +74,9 @@ class QuadrupedEnv(SkillEnv):
         self.keyframe_height, self.keyframe_pitch = self.keyframes.height, self.keyframes.pitch
         self.keyframe_joint_pos = self.keyframes.joint_pos
         self.keyframe_clearance = self.keyframes.clearance
-        self._limits = Limits.of(robot, device)
+        self._limits = limits = Limits.of(robot, device)
+        self.joint_limits = torch.stack([limits.low, limits.high])
+        self.velocity_limit, self.torque_limit = limits.velocity, limits.torque
         self.mass = float(self.scene.model.body_subtreemass[self.scene.base_body])
         self._ground = None
         if self._library:

@@ -149,6 +149,15 @@ class SkillEnv(VecEnv):
     keyframe_clearance: torch.Tensor
     """Height that a foot should clear in a step of each skill, (S,), m."""
 
+    joint_limits: torch.Tensor
+    """Least and largest angle of each joint, (2, J), rad; infinite for none."""
+
+    velocity_limit: torch.Tensor
+    """Largest velocity of each joint, (J,), rad/s; infinite for none."""
+
+    torque_limit: torch.Tensor
+    """Largest torque of each joint before randomization, (J,), N m."""
+
     mass: float
     """Mass of the robot before randomization, kg."""
 

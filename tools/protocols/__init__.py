@@ -19,6 +19,7 @@ from kiras_rl.tools.protocols import (
     heat_map,
     imitation,
     learning,
+    limits,
     obstacles,
     robustness,
     sampling,
@@ -30,6 +31,7 @@ from kiras_rl.tools.protocols.subject import Subject
 PROTOCOLS: dict[str, ModuleType] = {
     "flat": flat,
     "imitation": imitation,
+    "limits": limits,
     "transitions": transitions,
     "terrain": terrain,
     "heat_map": heat_map,
