@@ -151,10 +151,11 @@ def low_swing(step: Step, factor: float) -> torch.Tensor:
     return (lacking * _landing(step)).sum(-1) * ~step.stands
 
 
-@remembering(stance_time)
+@remembering(stance_time, air_time)
 def idle_feet(step: Step, most: float) -> torch.Tensor:
-    """Return the number of feet that have stood for longer than `most` s."""
-    return (step.memory[stance_time] > most).float().sum(-1) * ~step.stands
+    """Return the number of feet that have neither lifted off nor landed for over `most` s."""
+    idle = (step.memory[stance_time] > most) | (step.memory[air_time] > most)
+    return idle.float().sum(-1) * ~step.stands
 
 
 def flight(step: Step, feet: float) -> torch.Tensor:
@@ -194,6 +195,11 @@ def collision(step: Step, threshold: float) -> torch.Tensor:
 def stand_still(step: Step) -> torch.Tensor:
     """Return the sum of absolute joint velocities when asked to stand, rad/s."""
     return torch.where(step.stands, step.robot.joint_vel.abs().sum(-1), 0.0)
+
+
+def raised_feet(step: Step) -> torch.Tensor:
+    """Return the number of feet off the ground when asked to stand."""
+    return (~step.robot.foot_stands).float().sum(-1) * step.stands
 
 
 def stand_still_pose(step: Step) -> torch.Tensor:

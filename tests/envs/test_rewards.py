@@ -95,7 +95,7 @@ EXPECTED = {
     "short_swing": ({"least": 0.16}, 0.04 / 0.16),
     "short_stance": ({"least": 0.2}, 0.5),  # of the foot that lifts off now
     "low_swing": ({"factor": 1.5}, (1 - 0.03 / 0.06) ** 2),  # crawl's clearance is 4 cm
-    "idle_feet": ({"most": 0.05}, 1.0),
+    "idle_feet": ({"most": 0.11}, 2.0),  # both have been in the air for longer
     "flight": ({"feet": 2}, 1.0),
     "joint_limits": ({"margin": 0.1}, (0.7 - 0.5) + (1.7 - 1.4)),  # the targets are just inside
     "torque_limits": ({"share": 0.8}, 0.2),
@@ -105,6 +105,7 @@ EXPECTED = {
     "collision": ({"threshold": 0.1}, 1.0),
     "stand_still": ({}, 0.0),
     "stand_still_pose": ({}, 0.0),
+    "raised_feet": ({}, 0.0),
     "skill_height": ({"sigma": 0.05}, math.exp(-1.0)),  # 5 cm above crawl
     "skill_orientation": ({"sigma": 0.4}, math.exp(-(0.6**2 + 0.2**2) / 0.16)),
     "termination": ({}, 0.0),
@@ -138,6 +139,7 @@ def test_sideways_errors_count_as_much_as_they_are_asked_to():
 def test_standing_still_is_asked_for_by_a_small_command(command, stands):
     step = crafted(command)
     assert value("stand_still", step) == pytest.approx(0.6 + 0.4 if stands else 0.0)
+    assert value("raised_feet", step) == (1.0 if stands else 0.0)
     # from the keyframe of the commanded skill: (1, -2)
     assert value("stand_still_pose", step) == pytest.approx(0.3 + 0.3 if stands else 0.0)
 
