@@ -104,6 +104,8 @@ def make_metadata():
             "kp": robot.kp,
             "kd": robot.kd,
             "torque_limit": robot.torque_limit,
+            "joint_limits": robot.joint_limits,
+            "velocity_limit": robot.velocity_limit,
             "action_scale": robot.action_scale,
             "action_clip": 6.0,
             "observation": [

@@ -42,7 +42,7 @@ class Goal:
     saturated: float
 
 
-FLOOR = Goal(0.03, math.radians(5.0), 0.12, 0.05, (1.0, 4.5), 0.5, 0.01, 0.1)
+FLOOR = Goal(0.03, math.radians(5.0), 0.12, 0.05, (1.0, 4.5), 0.5, 0.01, 0.05)
 """What a skill must reach to be called learned."""
 
 TARGET = Goal(0.01, math.radians(2.0), 0.08, 0.0, (2.0, 3.5), 1.0, 0.0, 0.001)
