@@ -46,6 +46,7 @@ GAIT = (
 STANDING = (
     Column("drift", "cm", "{:.1f}", best="low"),
     Column("lifts of a foot", "1/s", "{:.2f}", best="low"),
+    Column("feet on the ground", "%", "{:.0f}", best="high"),
     Column("height - keyframe", "cm", "{:+.1f}"),
     Column("pitch - keyframe", "deg", "{:+.1f}"),
     Column("falls", "%", "{:.0f}", best="low"),
@@ -204,6 +205,7 @@ def _standing(r: dict) -> tuple[Cell, ...]:
     return (
         scaled(r["drift"], 100),
         _lifts(r),
+        scaled(r["duty"], 100),
         scaled(r["height"], 100),
         scaled(r["pitch"], 180 / math.pi),
         scaled(r["falls"], 100),
