@@ -200,6 +200,6 @@ def test_the_protocol_measures_the_shipped_policy(tmp_path, capsys, monkeypatch)
     rows = list(csv.reader(table.read_text().splitlines()))[1:]
     assert [row[:2] for row in rows] == [[s, p] for s in SKILLS for p in ("training", "second")]
     for training, second in zip(rows[::2], rows[1::2], strict=True):
-        assert float(second[4]) == pytest.approx(float(training[4]), abs=0.1)  # v_x, m/s
+        assert float(second[4]) == pytest.approx(float(training[4]), abs=0.2)  # v_x, m/s
     page = html.unescape((tmp_path / "report.html").read_text())
     assert "robot.yaml's, because the policy file has none" in page
