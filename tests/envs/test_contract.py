@@ -218,7 +218,7 @@ def test_commands_stay_in_their_ranges_and_some_ask_to_stand(build_env):
     stands = (command == 0).all(dim=1)
     assert stands.float().mean().item() == pytest.approx(0.1, abs=0.054)
     low, high = command.amin(dim=0), command.amax(dim=0)
-    torch.testing.assert_close(low, torch.tensor([-0.3, -0.1, -0.6]), atol=0.03, rtol=0)
+    torch.testing.assert_close(low, torch.tensor([-0.4, -0.1, -0.6]), atol=0.03, rtol=0)
     torch.testing.assert_close(high, torch.tensor([0.6, 0.2, 0.6]), atol=0.03, rtol=0)
 
 
@@ -265,7 +265,7 @@ def test_a_fall_ends_an_episode_and_is_no_time_out(env):
     assert torch.equal(extras[names.EXTRA_TIME_OUTS], ~fallen)
     assert dones.all()
     assert extras["log"]["Episode/falls"] == 2 and extras["log"]["Episode/time_outs"] == WORLDS - 2
-    assert rewards[fallen].max() < rewards[~fallen].min()
+    assert rewards[fallen].mean() < rewards[~fallen].mean() - 1.0
     assert extras["log"]["Reward/termination"].item() == pytest.approx(-2.0 * 2 / WORLDS)
 
 

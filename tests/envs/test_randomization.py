@@ -164,7 +164,9 @@ def coasting(env):
     qpos[:, 2], qvel[:, 6:] = 1.0, 2.0
     everywhere = torch.ones(env.num_envs, dtype=torch.bool)
     env.sim.write_state(everywhere, qpos, qvel, qpos[:, 7:])
-    env.sim.write_field("actuator_gainprm", everywhere, 0.0 * field(env, "actuator_gainprm") + 1e-9)
+    gains = field(env, "actuator_gainprm")
+    gains[..., [KP, KD]] = 0.0
+    env.sim.write_field("actuator_gainprm", everywhere, gains)
     env.step(torch.zeros(env.num_envs, 8))
     return env.sim.qvel[:, 6:]
 
@@ -205,9 +207,9 @@ def test_targets_arrive_late_by_whole_physics_steps(build, delay):
     held = hold(env)
     env.step(held)  # nothing moves but for the fall of 2 mm
     before = sensor(env, "torque")[:, -1]
-    env.step(held + 0.5)  # 0.25 rad: 1.25 N m more
-    change = (sensor(env, "torque") - before[:, None]).abs().amin(dim=(0, 2))
-    assert (change > 0.5).tolist() == [k >= delay for k in range(4)]
+    env.step(held + 0.7)  # 0.35 rad: 1.75 N m more
+    change = (sensor(env, "torque") - before[:, None]).abs().mean(dim=(0, 2))
+    assert (change > 0.3).tolist() == [k >= delay for k in range(4)]
 
 
 def test_the_first_delayed_targets_hold_the_pose(build):

@@ -23,6 +23,7 @@ from kiras_rl.tools.protocols import (
     obstacles,
     robustness,
     sampling,
+    sim2sim,
     terrain,
     transitions,
 )
@@ -37,6 +38,7 @@ PROTOCOLS: dict[str, ModuleType] = {
     "heat_map": heat_map,
     "obstacles": obstacles,
     "robustness": robustness,
+    "sim2sim": sim2sim,
     "sampling": sampling,
     "learning": learning,
 }
