@@ -94,12 +94,11 @@ def test_a_reward_is_a_function_and_a_line():
 
 def test_a_reward_may_remember_what_it_needs():
     env, _ = make_env("solo8_soft", "env.commands.zero_probability=0")
-    falling = torch.zeros(4, 4)
-    landed = 0
+    falling, in_air, landed = torch.zeros(4, 4), torch.zeros(4, 4) > 0, 0
     for _ in range(40):
         _, _, dones, extras = env.step(1.5 * torch.randn(4, 8))
         stands = env.measure().foot_stands
-        landing = stands & in_air if landed or _ else torch.zeros_like(stands)
+        landing = stands & in_air
         expected = -0.2 * (falling * landing).sum(1).mean()
         torch.testing.assert_close(extras["log"]["Reward/hard_landing"], expected)
         landed += landing.sum()
