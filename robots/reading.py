@@ -9,7 +9,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
+
+from kiras_rl.yaml_files import YamlError, read_yaml_file
 
 
 class RobotError(ValueError):
@@ -23,17 +24,19 @@ def hint(name: object, allowed: Iterable[str]) -> str:
 
 
 def read_yaml(path: Path) -> dict[str, Any]:
-    """Return the mapping in a YAML file.
+    """Return the mapping in a YAML file, read as configurations are.
 
     Raises:
         RobotError: if the file is missing, is not YAML or holds no mapping.
     """
     try:
-        entries = yaml.safe_load(path.read_text(encoding="utf-8"))
+        entries = read_yaml_file(path)
     except FileNotFoundError as error:
         raise RobotError(f"{path} is missing") from error
-    except yaml.YAMLError as error:
-        raise RobotError(f"{path} is not valid YAML: {' '.join(str(error).split())}") from error
+    except OSError as error:
+        raise RobotError(f"{path} cannot be read: {error.strerror}") from error
+    except YamlError as error:
+        raise RobotError(f"{path} is not valid YAML: {error}") from error
     if not isinstance(entries, dict) or not entries:
         raise RobotError(f"{path} must hold `name: value` entries")
     return entries
