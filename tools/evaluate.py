@@ -16,6 +16,7 @@ from kiras_rl.deploy.metadata import PolicyError
 from kiras_rl.evaluation.flat import SETTLE
 from kiras_rl.robots.robot import RobotError
 from kiras_rl.tools.arguments import at_least, seconds_above
+from kiras_rl.tools.ending import finish
 from kiras_rl.tools.protocols import PROTOCOLS, known
 from kiras_rl.tools.protocols.subject import Options, Subject
 from kiras_rl.tools.protocols.terrain import LEVELS
@@ -67,20 +68,12 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def exit_code(work: Callable[[], object]) -> int:
-    """Do the work of a command; a mistake of the user's and Ctrl-C are one line each.
+    """Do the work of a command, see `finish`; return its exit status."""
 
-    Returns:
-        0 where it was done, 2 after a mistake, 130 after Ctrl-C.
-    """
-    try:
+    def measure_and_write() -> None:
         work()
-    except MISTAKES as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        print("stopped; the same command goes on from here", file=sys.stderr)
-        return 130
-    return 0
+
+    return finish(measure_and_write, MISTAKES, "stopped; the same command goes on from here")
 
 
 def evaluate(subject: Subject, names: list[str]) -> Path:

@@ -14,6 +14,7 @@ from rich.table import Table
 
 from kiras_rl.deploy.policy import OnboardPolicy, PolicyError, PolicyMetadata
 from kiras_rl.tools import policy_files
+from kiras_rl.tools.ending import finish
 
 _DESCRIPTION = """\
 Write the policy of a training run as one ONNX file with everything a robot needs: network, joint
@@ -47,12 +48,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("source", type=Path, metavar="RUN|CHECKPOINT", help="what to export")
     parser.add_argument("--out", type=Path, metavar="FILE", help="file to write")
     options = parser.parse_args(arguments)
-    try:
-        _export(options.source, options.out)
-    except (PolicyError, OSError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    return 0
+    return finish(lambda: _export(options.source, options.out), (PolicyError,))
 
 
 def _export(source: Path, out: Path | None) -> None:

@@ -19,6 +19,7 @@ from rich.table import Table
 from kiras_rl.robots.robot import Keyframe, Robot, RobotError, load_robot
 from kiras_rl.robots.statics import KeyframeReport, examine_keyframe
 from kiras_rl.tools.arguments import PICTURES, file_of
+from kiras_rl.tools.ending import finish
 from kiras_rl.tools.rendering import RenderError, make_renderer
 
 TILE = (420, 340)
@@ -38,19 +39,17 @@ def main(argv: list[str] | None = None) -> int:
         "--out", type=file_of(PICTURES), help="picture (default: runs/keyframes/ROBOT.png)"
     )
     arguments = parser.parse_args(argv)
-    try:
-        robot = load_robot(arguments.robot)
-    except RobotError as error:
-        return _fail(str(error))
+    return finish(lambda: _show(arguments.robot, arguments.out), (RobotError,))
+
+
+def _show(name: str, out: Path | None) -> int:
+    robot = load_robot(name)
     reports = [examine_keyframe(robot, keyframe) for keyframe in robot.keyframes]
     Console().print(make_table(robot, reports))
     problems = [problem for report in reports if (problem := report.problem())]
     for problem in problems:
         _fail(problem)
-    try:
-        drawn = _save_picture(reports, arguments.out)
-    except OSError as error:
-        return _fail(str(error))
+    drawn = _save_picture(reports, out)
     return 2 if problems or not drawn else 0
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 
 from rich.console import Console
@@ -15,6 +16,7 @@ from kiras_rl.robots.robot import RobotError
 from kiras_rl.tools import policy_files, summary
 from kiras_rl.tools.arguments import PICTURES, file_of
 from kiras_rl.tools.driver import Driver
+from kiras_rl.tools.ending import finish
 from kiras_rl.tools.ground import FLAT, terrain_of
 from kiras_rl.tools.rendering import RenderError
 from kiras_rl.tools.script import (
@@ -80,17 +82,12 @@ _OUTPUTS = {
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; return its exit status."""
     options = _parser().parse_args(arguments)
-    try:
-        if _is_live(options):
-            _drive(options)
-        else:
-            _play(options)
-    except KeyboardInterrupt:
-        return 0
-    except (PolicyError, RobotError, RenderError, LiveError, ConfigError, OSError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    return 0
+
+    def work() -> None:
+        with suppress(KeyboardInterrupt):  # Ctrl-C is how a drive ends
+            _drive(options) if _is_live(options) else _play(options)
+
+    return finish(work, (ConfigError, LiveError, PolicyError, RenderError, RobotError))
 
 
 def _parser() -> argparse.ArgumentParser:

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import copy
 import re
+import shlex
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
 
@@ -16,6 +19,7 @@ from kiras_rl.config import ConfigError, check_resume_overrides, config_from_dic
 from kiras_rl.deploy.policy import OnboardPolicy, PolicyError, PolicyMetadata
 from kiras_rl.envs import make_env, resolve_backend
 from kiras_rl.export import ExportError, export_policy
+from kiras_rl.ownership import owning
 from kiras_rl.phases import (
     FINETUNING,
     SKILL_LEARNING,
@@ -28,6 +32,7 @@ from kiras_rl.runner import KirasRunner
 from kiras_rl.schema import Config
 from kiras_rl.soundness import TrainingError
 from kiras_rl.tools.curves import draw_curves
+from kiras_rl.tools.ending import is_out_of_memory, one_line
 from kiras_rl.tools.evaluator import check_terrain, make_evaluators, onboard_policy
 from kiras_rl.tools.flat_policy import check_fit, read_flat, sizes
 from kiras_rl.tools.progress import Progress
@@ -55,10 +60,9 @@ console = Console()
 
 def message_of(error: Exception) -> str:
     """Return the one line that a user reads of a mistake."""
-    line = " ".join(str(error).split())
-    if isinstance(error, torch.OutOfMemoryError):
-        line += " Fewer worlds need less: lower num_envs"
-    return line
+    if is_out_of_memory(error):
+        return f"not enough memory ({one_line(error)}): fewer worlds need less, lower num_envs"
+    return one_line(error)
 
 
 # --- a learner -----------------------------------------------------------------------------------
@@ -93,12 +97,14 @@ def resume(source: Path, overrides: list[str]) -> KirasRunner:
         source: The checkpoint.
         overrides: `key=value` strings for the keys that may change.
 
+    Own its folder meanwhile (`owning`): another process may write a newer one.
+
     Raises:
         CheckpointError: Unusable file, or one outside of a run.
         ConfigError: A key that may not change.
     """
     check_resume_overrides(overrides)
-    run_dir, (values, phase) = _run_of(source), distributed.from_main(lambda: _read_run(source))
+    run_dir, (values, phase) = run_of(source), distributed.from_main(lambda: _read_run(source))
     config = config_from_dict(values, overrides)
     if phase == FINETUNING and config.iterations != values["iterations"]:
         raise ConfigError(
@@ -150,7 +156,12 @@ def networks_of(config: Config, phase: str) -> dict[str, list[tuple[int, ...]]]:
     return sizes(build(trial, None, phase, num_envs=1).alg.networks())
 
 
-def _run_of(source: Path) -> Path:
+def run_of(source: Path) -> Path:
+    """Return the run folder that a checkpoint lies in.
+
+    Raises:
+        CheckpointError: It lies in none.
+    """
     if source.absolute().parent.name != checkpoint.FOLDER:
         raise CheckpointError(
             f"{source} lies in no run: give the run folder, or a file in its {checkpoint.FOLDER}/"
@@ -238,6 +249,11 @@ def train_run(runner: KirasRunner, stop: StopRequest) -> bool:
         Whether the run came to its end.
     """
     assert runner.run_dir is not None
+    with owning(runner.run_dir), _telling_what_is_left(runner.run_dir):
+        return _train_owned(runner, stop)
+
+
+def _train_owned(runner: KirasRunner, stop: StopRequest) -> bool:
     distributed.from_main(lambda: _begin_folder(runner))
     _announce(runner)
     with Progress(console) as progress:
@@ -250,9 +266,21 @@ def train_run(runner: KirasRunner, stop: StopRequest) -> bool:
     return finished
 
 
+@contextmanager
+def _telling_what_is_left(run_dir: Path) -> Iterator[None]:
+    """Note on whatever ends a training before its time from where it goes on."""
+    try:
+        yield
+    except BaseException as error:
+        latest = run_dir / checkpoint.FOLDER / checkpoint.LATEST
+        again = f"go on with: kiras-train --resume {shlex.quote(str(run_dir))}"
+        whole = f"{latest} is whole, {again}" if latest.is_file() else "there is no checkpoint yet"
+        error.add_note(whole)
+        raise
+
+
 def _begin_folder(runner: KirasRunner) -> None:
     assert runner.run_dir is not None
-    runner.run_dir.mkdir(parents=True, exist_ok=True)
     save_config(runner.config, runner.run_dir / CONFIG)
 
 
