@@ -104,8 +104,8 @@ def check_name(name: str, what: str, where: str) -> None:
     """
     if not re.fullmatch(r"[A-Za-z_][A-Za-z0-9_.-]*", name):
         raise RobotError(
-            f"{what} {name!r}: a name has letters, digits, _ . and -, and begins with a letter or _ "
-            f"({where})"
+            f"{what} {name!r}: a name has letters, digits, _ . and -, and begins with a "
+            f"letter or _ ({where})"
         )
 
 

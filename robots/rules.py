@@ -70,14 +70,14 @@ def check_named_parts(
         named: names of all geoms that robot.yaml names.
 
     Raises:
-        RobotError: if the base does not float, a named geom touches nothing, feet are no spheres of one
-            size, or legs differ.
+        RobotError: if the base does not float, a named geom touches nothing, feet are no spheres of
+            one size, or legs differ.
     """
     base = int(model.jnt_bodyid[0])
     if model.body(base_body).id != base:
         raise RobotError(
-            f"base_body: {base_body!r} does not carry the free joint; name {model.body(base).name!r}"
-            f" in {path}"
+            f"base_body: {base_body!r} does not carry the free joint; name "
+            f"{model.body(base).name!r} in {path}"
         )
     for name in named:
         if not model.geom(name).conaffinity[0]:
@@ -196,11 +196,11 @@ def _check_legs(model: mujoco.MjModel, feet: tuple[str, ...], path: Path) -> Non
         hinges = {int(model.jnt_bodyid[joint]) for joint in _chain(model, foot)}
         distance = np.linalg.norm(_foot(model, foot) - data.geom(foot).xpos)
         if len(hinges) < len(_chain(model, foot)) or distance > _TOLERANCE:
+            mjcf = path.with_name(f"{path.parent.name}.xml")
             raise RobotError(
-                f"{path.with_name(path.parent.name + '.xml')}: foot {foot!r} is {100 * distance:.1f} "
-                "cm from where single hinges through the origins of its bodies, whose frames are "
-                "parallel at angle 0, put it: leave out pos of the legs' joints and euler, quat and "
-                "axisangle of their bodies"
+                f"{mjcf}: foot {foot!r} is {100 * distance:.1f} cm from where single hinges "
+                "through the origins of its bodies, whose frames are parallel at angle 0, put it: "
+                "leave out pos of the legs' joints and euler, quat and axisangle of their bodies"
             )
 
 
