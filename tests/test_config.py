@@ -76,7 +76,8 @@ def numbers(kind, prefix=""):
 ZERO = {  # numbers whose range begins at zero; solo8 has no terrain in its first phase
     key: limits.above
     for key, limits in LIMITS.items()
-    if limits.low == 0 and "seed" not in key
+    if limits.low == 0
+    and "seed" not in key
     and key in numbers(Config)
     and key not in SCHEDULES
     and ".terrain." not in key

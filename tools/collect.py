@@ -9,7 +9,6 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from rich.console import Console
 from rich.table import Table
 
 from kiras_rl.checkpoint import versions
@@ -21,6 +20,7 @@ from kiras_rl.robots.robot import RobotError
 from kiras_rl.schema import Config
 from kiras_rl.tools.arguments import at_least, seconds_above
 from kiras_rl.tools.collector import Plan, Range, collect
+from kiras_rl.tools.console import make_console
 from kiras_rl.tools.ending import finish
 from kiras_rl.tools.evaluator import (
     evaluation_physics,
@@ -57,7 +57,7 @@ MISTAKES = (ConfigError, DatasetError, PolicyError, RobotError)
 
 MANY = ("npz", "lerobot", "both")
 
-console = Console()
+console = make_console()
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -53,4 +53,8 @@ def train() -> int:
 
 
 def _run(name: str) -> int:
-    return finish(lambda: import_module(f"kiras_rl.tools.{name}").main())
+    def work() -> int:
+        import_module("kiras_rl.robots")  # MuJoCo first, whatever graphics there are
+        return import_module(f"kiras_rl.tools.{name}").main()
+
+    return finish(work)

@@ -7,7 +7,6 @@ import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 
 from kiras_rl.checkpoint import CheckpointError
@@ -16,6 +15,7 @@ from kiras_rl.deploy.metadata import PolicyError
 from kiras_rl.evaluation.flat import SETTLE
 from kiras_rl.robots.robot import RobotError
 from kiras_rl.tools.arguments import at_least, seconds_above
+from kiras_rl.tools.console import make_console
 from kiras_rl.tools.ending import finish
 from kiras_rl.tools.protocols import PROTOCOLS, known
 from kiras_rl.tools.protocols.subject import Options, Subject
@@ -53,7 +53,7 @@ MISTAKES = (CheckpointError, ConfigError, OSError, PolicyError, RobotError)
 
 ALL = list(PROTOCOLS)
 
-console = Console()
+console = make_console()
 
 
 def main(argv: list[str] | None = None) -> int:

@@ -9,11 +9,11 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from rich.console import Console
 from rich.table import Table
 
 from kiras_rl.deploy.policy import OnboardPolicy, PolicyError, PolicyMetadata
 from kiras_rl.tools import policy_files
+from kiras_rl.tools.console import make_console
 from kiras_rl.tools.ending import finish
 
 _DESCRIPTION = """\
@@ -67,7 +67,7 @@ def _export(source: Path, out: Path | None) -> None:
     table.add_row("latency", f"{median:.3f} ms median, {slowest:.3f} ms p99, one thread")
     for name, text in _describe(policy.metadata):
         table.add_row(name, text)
-    Console().print(table)
+    make_console().print(table)
 
 
 def _step_times(policy: OnboardPolicy) -> np.ndarray:

@@ -13,12 +13,12 @@ import mujoco
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from rich.console import Console
 from rich.table import Table
 
 from kiras_rl.robots.robot import Keyframe, Robot, RobotError, load_robot
 from kiras_rl.robots.statics import KeyframeReport, examine_keyframe
 from kiras_rl.tools.arguments import PICTURES, file_of
+from kiras_rl.tools.console import make_console
 from kiras_rl.tools.ending import finish
 from kiras_rl.tools.rendering import RenderError, make_renderer
 
@@ -45,7 +45,7 @@ def main(argv: list[str] | None = None) -> int:
 def _show(name: str, out: Path | None) -> int:
     robot = load_robot(name)
     reports = [examine_keyframe(robot, keyframe) for keyframe in robot.keyframes]
-    Console().print(make_table(robot, reports))
+    make_console().print(make_table(robot, reports))
     problems = [problem for report in reports if (problem := report.problem())]
     for problem in problems:
         _fail(problem)

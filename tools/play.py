@@ -8,13 +8,12 @@ from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 
-from rich.console import Console
-
 from kiras_rl.config import ConfigError
 from kiras_rl.deploy.policy import PolicyError
 from kiras_rl.robots.robot import RobotError
 from kiras_rl.tools import policy_files, summary
 from kiras_rl.tools.arguments import PICTURES, file_of
+from kiras_rl.tools.console import make_console
 from kiras_rl.tools.driver import Driver
 from kiras_rl.tools.ending import finish
 from kiras_rl.tools.ground import FLAT, terrain_of
@@ -164,7 +163,7 @@ def _play(options: argparse.Namespace) -> None:
     trace = record(driver, _script(options, driver))
     if options.table or not (options.trace or options.frames or options.video):
         rows = summary.summarize(trace, driver.metadata)
-        Console().print(summary.table(rows, trace.title))
+        make_console().print(summary.table(rows, trace.title))
     if options.trace:
         _save_trace(trace, driver, options.trace)
     if options.frames or options.video:

@@ -17,6 +17,7 @@ from typing import Any
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from rich.table import Table
+from rich.text import Text
 
 from kiras_rl.checkpoint import LATEST, CheckpointError, find_checkpoint, load_checkpoint
 from kiras_rl.config import (
@@ -302,7 +303,7 @@ def train_sweep(runs: list[Run]) -> Report:
             if stop.requested:
                 break
             if len(runs) > 1:
-                console.print(f"[bold]run {number}/{len(runs)}[/] {run.name}", highlight=False)
+                console.print(Text(f"run {number}/{len(runs)}", style="bold"), run.name)
             try:
                 done += _train(run, stop)
             except MISTAKES as error:

@@ -13,7 +13,6 @@ import mujoco
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from rich.console import Console
 from rich.table import Table
 
 from kiras_rl.config import ConfigError, load_config
@@ -23,6 +22,7 @@ from kiras_rl.phases import FINETUNING, phase_config
 from kiras_rl.robots.robot import Robot, RobotError, load_robot
 from kiras_rl.schema import Config
 from kiras_rl.tools.arguments import PICTURES, file_of
+from kiras_rl.tools.console import make_console
 from kiras_rl.tools.ending import finish
 from kiras_rl.tools.rendering import RenderError, make_renderer
 from kiras_rl.tools.terrain_budgets import measure_budgets
@@ -58,7 +58,7 @@ def _show(arguments: argparse.Namespace) -> None:
     robot = load_robot(config.robot)
     library = _library(config)
     if arguments.budgets:
-        Console().print(make_table(config, robot, library))
+        make_console().print(make_table(config, robot, library))
         return
     path = arguments.out or Path("runs", "terrains", f"{robot.name}.png")
     path.parent.mkdir(parents=True, exist_ok=True)

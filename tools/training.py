@@ -11,7 +11,7 @@ from dataclasses import asdict
 from pathlib import Path
 
 import torch
-from rich.console import Console
+from rich.text import Text
 
 from kiras_rl import checkpoint, distributed
 from kiras_rl.checkpoint import CheckpointError
@@ -31,6 +31,7 @@ from kiras_rl.robots.robot import RobotError
 from kiras_rl.runner import KirasRunner
 from kiras_rl.schema import Config
 from kiras_rl.soundness import TrainingError
+from kiras_rl.tools.console import make_console
 from kiras_rl.tools.curves import draw_curves
 from kiras_rl.tools.ending import is_out_of_memory, one_line
 from kiras_rl.tools.evaluator import check_terrain, make_evaluators, onboard_policy
@@ -55,7 +56,7 @@ MISTAKES = (
 CONFIG, POLICY = "config.yaml", "policy.onnx"
 """Files of a run; the second one is the last that is written."""
 
-console = Console()
+console = make_console()
 
 
 def message_of(error: Exception) -> str:
@@ -329,11 +330,12 @@ def _announce(runner: KirasRunner) -> None:
     steps = ranks * config.num_envs * config.learner.ppo.num_steps * sum(lengths)
     worlds = f"{config.num_envs} worlds" if ranks == 1 else f"{ranks} x {config.num_envs} worlds"
     console.print(
-        f"[bold]{config.robot}[/]: {_what_begins(runner)}, {', '.join(runner.env.skills)} | "
+        Text(config.robot, style="bold", end=""),
+        f": {_what_begins(runner)}, {', '.join(runner.env.skills)} | "
         f"{worlds}, {backend} physics, {runner.device} | "
         f"{' + '.join(map(str, lengths))} iterations, {steps / 1e6:.1f} M steps | "
         f"{runner.run_dir}",
-        highlight=False,
+        sep="",
         soft_wrap=True,
     )
 
@@ -363,11 +365,11 @@ def _conclude(runner: KirasRunner) -> None:
         console.print(as_rich(flat.table({run_dir.name: results}, "Best policy, flat ground")))
     if evaluators.terrain:
         console.print(as_rich(terrain.result_table(evaluators.terrain(policy))))
+    folder = shlex.quote(str(run_dir))
     console.print(
         f"{runner.seconds / 60:.1f} min of training\n"
         f"checkpoint  {best}\nONNX        {onnx}\ncurves      {curves}\n"
-        f"next:       kiras-play {run_dir} --trace trace.png\n"
-        f"            tensorboard --logdir {run_dir}",
-        highlight=False,
+        f"next:       kiras-play {folder} --trace trace.png\n"
+        f"            tensorboard --logdir {folder}",
         soft_wrap=True,
     )
