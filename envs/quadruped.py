@@ -31,6 +31,7 @@ from kiras_rl.envs.terrain_library import build_library
 from kiras_rl.envs.terrains import CROSSED
 from kiras_rl.interfaces import Measurements, SkillEnv
 from kiras_rl.recorded import Recorded, copied
+from kiras_rl.robots.identity import change, identity
 from kiras_rl.robots.robot import Robot
 from kiras_rl.schema import EnvConfig, SimConfig
 
@@ -386,6 +387,14 @@ class QuadrupedEnv(SkillEnv):
     def foot_height_b(self, gravity_b: torch.Tensor, joint_pos: torch.Tensor) -> torch.Tensor:
         """Return the height of each foot's lowest point above the base, (N, F), m."""
         return self._kinematics.foot_height_b(gravity_b, joint_pos)
+
+    def robot_identity(self) -> dict:
+        """Return what a training depends on of the robot, as plain values."""
+        return identity(self.robot_cfg)
+
+    def robot_change(self, before: dict) -> str | None:
+        """Return how the robot differs from an earlier `robot_identity`, None if it does not."""
+        return change(before, self.robot_identity())
 
     def name_term(self, group: str, column: int) -> str:
         """Name the term that a column of a group of observations comes from."""

@@ -22,7 +22,7 @@ from kiras_rl.tools.protocols.subject import Options, Subject
 from kiras_rl.tools.protocols.terrain import LEVELS
 from kiras_rl.tools.report.about import about_table
 from kiras_rl.tools.report.content import Section
-from kiras_rl.tools.report.files import write_report
+from kiras_rl.tools.report.files import check_page, write_report
 from kiras_rl.tools.report.terminal import as_rich
 from kiras_rl.tools.training import resolve_device
 
@@ -78,6 +78,7 @@ def exit_code(work: Callable[[], object]) -> int:
 
 def evaluate(subject: Subject, names: list[str]) -> Path:
     """Run protocols, print their tables and write the report after each; return its page."""
+    check_page(subject.folder)
     sections: list[Section] = []
     page = subject.folder
     for name, values in measure([subject], names):

@@ -15,6 +15,7 @@ from kiras_rl.deploy.policy import OnboardPolicy, PolicyError, PolicyMetadata
 from kiras_rl.tools import policy_files
 from kiras_rl.tools.console import make_console
 from kiras_rl.tools.ending import finish
+from kiras_rl.tools.outputs import OutputError, check_output
 
 _DESCRIPTION = """\
 Write the policy of a training run as one ONNX file with everything a robot needs: network, joint
@@ -52,6 +53,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _export(source: Path, out: Path | None) -> None:
+    if out:
+        _check_place(out)
     checkpoint = policy_files.find_checkpoint(source)
     beside = source / "policy.onnx" if source.is_dir() else source.with_suffix(".onnx")
     report = policy_files.export_checkpoint(checkpoint, out or beside)
@@ -68,6 +71,23 @@ def _export(source: Path, out: Path | None) -> None:
     for name, text in _describe(policy.metadata):
         table.add_row(name, text)
     make_console().print(table)
+
+
+def _check_place(path: Path) -> None:
+    """Refuse the place of anything but a policy file.
+
+    Raises:
+        OutputError: There is something else.
+    """
+    try:
+        if path.is_file():
+            OnboardPolicy(path)
+        else:
+            check_output(path, "kiras-export")
+    except PolicyError:
+        raise OutputError(
+            f"{path} is there and is no policy file: name another file, or remove it"
+        ) from None
 
 
 def _step_times(policy: OnboardPolicy) -> np.ndarray:

@@ -17,6 +17,7 @@ from kiras_rl.tools.console import make_console
 from kiras_rl.tools.driver import Driver
 from kiras_rl.tools.ending import finish
 from kiras_rl.tools.ground import FLAT, terrain_of
+from kiras_rl.tools.outputs import check_output, save_arrays
 from kiras_rl.tools.rendering import RenderError
 from kiras_rl.tools.script import (
     Segment,
@@ -67,6 +68,7 @@ examples:
   kiras-play --script walk:4:0.3,crawl:4:0.3        skill:seconds:v_x[:v_y[:yaw_rate]], ...
 """
 
+TRACE = "kiras-play --trace"
 _COMMAND = "0.3"  # m/s, of a script that is not given
 _SCREENSHOT_SPEED = 0.3  # m/s
 
@@ -83,6 +85,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = _parser().parse_args(arguments)
 
     def work() -> None:
+        _check_outputs(options)
         with suppress(KeyboardInterrupt):  # Ctrl-C is how a drive ends
             _drive(options) if _is_live(options) else _play(options)
 
@@ -123,6 +126,13 @@ def _add_live_options(group: argparse._ArgumentGroup) -> None:
     add("--host", default=LOOPBACK, help=f"address that the page listens on ({LOOPBACK})")
     add("--port", type=int, default=DEFAULT_PORT, help=f"its port, 0: any ({DEFAULT_PORT})")
     add("--no-browser", action="store_true", help="only print the page's address")
+
+
+def _check_outputs(options: argparse.Namespace) -> None:
+    for option in _OUTPUTS:
+        path = getattr(options, option[2:])
+        if path:
+            check_output(path, f"kiras-play {option}")
 
 
 def _is_live(options: argparse.Namespace) -> bool:
@@ -178,8 +188,7 @@ def _script(options: argparse.Namespace, driver: Driver) -> list[Segment]:
 
 def _save_trace(trace: Trace, driver: Driver, path: Path) -> None:
     if path.suffix == ".npz":
-        path.parent.mkdir(parents=True, exist_ok=True)
-        trace.save(path)
+        save_arrays(trace.arrays(), path, TRACE)
     else:
         from kiras_rl.tools.trace_figure import save_trace_figure  # matplotlib takes a second
 

@@ -24,8 +24,11 @@ from kiras_rl.schema import Config
 from kiras_rl.tools.arguments import PICTURES, file_of
 from kiras_rl.tools.console import make_console
 from kiras_rl.tools.ending import finish
+from kiras_rl.tools.outputs import check_output, save_figure
 from kiras_rl.tools.rendering import RenderError, make_renderer
 from kiras_rl.tools.terrain_budgets import measure_budgets
+
+WRITER = "kiras-terrains"
 
 TILE = (300, 200)
 """Width and height of one tile in pixels."""
@@ -53,16 +56,17 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _show(arguments: argparse.Namespace) -> None:
+    if arguments.out:
+        check_output(arguments.out, WRITER)
     whole = load_config(arguments.cfg, [f"robot={arguments.robot}", *arguments.overrides])
     config = phase_config(whole, FINETUNING)
     robot = load_robot(config.robot)
     library = _library(config)
+    path = arguments.out or Path("runs", "terrains", f"{robot.name}.png")
     if arguments.budgets:
         make_console().print(make_table(config, robot, library))
         return
-    path = arguments.out or Path("runs", "terrains", f"{robot.name}.png")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    draw(robot, library).savefig(path)
+    save_figure(draw(robot, library), path, WRITER)
     print(f"picture: {path}")
 
 

@@ -108,6 +108,11 @@ def _parse(argv: list[str] | None) -> argparse.Namespace:
         metavar="LABEL/seed_N",
         help="with --sweep: train this run of it and no other, as one job of a cluster, say",
     )
+    parser.add_argument(
+        "--changed-robot",
+        action="store_true",
+        help="with --resume: go on with today's robot though its files have changed since",
+    )
     parser.add_argument("--runs", type=Path, default=Path("runs"), help="where runs are written")
     parser.add_argument("overrides", nargs="*", metavar="key=value", help="keys to set")
     return parser.parse_intermixed_args(argv)
@@ -125,13 +130,15 @@ def _train(args: argparse.Namespace) -> int:
 
 
 def _train_one(args: argparse.Namespace) -> int:
+    if args.changed_robot and args.resume is None:
+        raise ConfigError("--changed-robot is about a run that goes on: give it with --resume")
     if args.resume is None:
         return _train_run(_new_run(args))
     if args.flat is not None:
         raise ConfigError("--flat begins a new run: give it with --cfg, not with --resume")
     source = _find(args.resume, LATEST)
     with owning(run_of(source)):
-        return _train_run(resume(source, args.overrides))
+        return _train_run(resume(source, args.overrides, args.changed_robot))
 
 
 def _train_run(runner: KirasRunner) -> int:

@@ -91,12 +91,13 @@ def begin(config: Config, flat: Path | None = None) -> KirasRunner:
     return runner
 
 
-def resume(source: Path, overrides: list[str]) -> KirasRunner:
+def resume(source: Path, overrides: list[str], changed_robot: bool = False) -> KirasRunner:
     """Return the learner of a run that goes on from one of its checkpoints.
 
     Args:
         source: The checkpoint.
         overrides: `key=value` strings for the keys that may change.
+        changed_robot: Go on with the robot of today though its files have changed.
 
     Own its folder meanwhile (`owning`): another process may write a newer one.
 
@@ -115,6 +116,7 @@ def resume(source: Path, overrides: list[str]) -> KirasRunner:
     if phase == SKILL_LEARNING:
         check(config)
     runner = build(config, run_dir, phase)
+    runner.takes_changed_robot = changed_robot
     runner.load(str(source))
     return runner
 
