@@ -8,6 +8,7 @@ from __future__ import annotations
 import os
 import signal
 import sys
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from types import FrameType
@@ -48,7 +49,7 @@ def finish(
         The exit status: that of the work, 2 after a mistake, 128 + the signal after an interrupt.
     """
     try:
-        with _signals(), _lasting_output():
+        with _signals(), _lasting_output(), _quiet_threads():
             return work() or 0
     except KeyboardInterrupt as interrupt:
         status = 128 + getattr(interrupt, "number", int(signal.SIGINT))
@@ -110,6 +111,25 @@ def _lasting_output() -> Iterator[None]:
             sys.stdout.flush()
     finally:
         sys.stdout, sys.stderr = before
+
+
+@contextmanager
+def _quiet_threads() -> Iterator[None]:
+    """Leave what the system refuses a thread that writes to the one that waits for it.
+
+    The thread of TensorBoard's log keeps its error for the next line, and prints it besides.
+    """
+    before = threading.excepthook
+
+    def tell(fault: threading.ExceptHookArgs) -> None:
+        if not isinstance(fault.exc_value, OSError):
+            before(fault)
+
+    threading.excepthook = tell
+    try:
+        yield
+    finally:
+        threading.excepthook = before
 
 
 class _Output:

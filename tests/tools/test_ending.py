@@ -6,6 +6,7 @@ import io
 import os
 import signal
 import sys
+import threading
 
 import pytest
 
@@ -99,6 +100,19 @@ def test_a_mistake_is_one_line(error, line, capsys):
     assert finish(work, (ValueError,)) == 2
     err = capsys.readouterr().err
     assert err.startswith(line) and err.count("\n") == 1
+
+
+def test_what_the_disk_refuses_a_thread_is_left_to_who_waits_for_it(capsys):
+    def refuse():
+        raise OSError(28, "No space left on device")
+
+    def work():
+        thread = threading.Thread(target=refuse)
+        thread.start()
+        thread.join()
+
+    assert finish(work) == 0
+    assert capsys.readouterr() == ("", "")
 
 
 def test_a_fault_of_the_program_is_no_mistake_of_its_user():
