@@ -25,7 +25,7 @@ class SensorLayout:
         foot_force_w: Net contact force of each foot on the ground, F * 3, N.
         base_force_w: The same for the geoms of the base, B * 3, N.
         limb_force_w: The same for the penalised geoms, L * 3, N.
-        joint_torque: Actuator torques, J, N m.
+        joint_torque: Torques that actuators give to joints, J, N m.
         motion: Orientation of the base (w, x, y, z), its angular velocity in the base frame,
             rad/s, joint angles, rad, and joint velocities, rad/s, 7 + 2 J; None where no
             observation is late.
@@ -128,8 +128,9 @@ def _add_sensors(spec: mujoco.MjSpec, robot: Robot) -> dict[str, list[str]]:
         "foot_force_w": add("foot", contact, geom, robot.foot_geoms),
         "base_force_w": add("base", contact, geom, robot.base_geoms),
         "limb_force_w": add("limb", contact, geom, robot.penalised_geoms),
+        # What the joint gets: the MJCF may limit it (actuatorfrcrange) more than the actuator.
         "joint_torque": add(
-            "torque", _SENSOR.mjSENS_ACTUATORFRC, _OBJ.mjOBJ_ACTUATOR, robot.joint_names
+            "torque", _SENSOR.mjSENS_JOINTACTFRC, _OBJ.mjOBJ_JOINT, robot.joint_names
         ),
     }
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import torch
 
 from kiras_rl.config import ConfigError
-from kiras_rl.envs.lookup import find_function
+from kiras_rl.envs.lookup import evaluate, find_function
 from kiras_rl.envs.sensing import Sensed
 from kiras_rl.envs.state import Keyframes, RobotState, Task
 
@@ -135,6 +135,7 @@ class ObservationGroup:
     """An ordered list of scaled terms.
 
     Attributes:
+        where: Key of the group in the YAML.
         names: Terms in order.
         sizes: Numbers of each term.
         scales: Scale of each term.
@@ -145,14 +146,18 @@ class ObservationGroup:
         """Look the terms up and derive the sizes by calling them once.
 
         Raises:
-            ConfigError: Unknown term or key.
+            ConfigError: Unknown term or key, or a term of another shape than (N, k).
         """
         terms = {key: value for key, value in terms.items() if value is not None}
-        where = f"env.observations.{name}"
+        self.where = where = f"env.observations.{name}"
         self.names = list(terms)
         self._terms = [find_function(globals(), key, View, where) for key in terms]
         _check_keys(terms, where)
-        outputs = [term(view) for term in self._terms]
+        worlds = len(view.last_action)
+        outputs = [
+            evaluate(term, view, f"{where}.{name}", (worlds, None))
+            for name, term in zip(self.names, self._terms, strict=True)
+        ]
         self.sizes = [output.shape[1] for output in outputs]
         self.scales = [float(value.get("scale", 1.0)) for value in terms.values()]
         noises = [float(value.get("noise", 0.0)) for value in terms.values()]

@@ -73,6 +73,21 @@ class Observer:
         """Return what the critic sees of any view, (rows, C)."""
         return torch.cat([self.proprio(view), self.critic(view)], dim=1)
 
+    def name_term(self, group: str, column: int) -> str | None:
+        """Return the YAML key of what a column of a group comes from, None if it has none."""
+        parts = {
+            names.PROPRIO: (self.proprio,),
+            names.HISTORY: (self.proprio,) * self._config.history_length,
+            names.CRITIC: (self.proprio, self.critic),
+            names.IMITATION: (self.imitation,),
+        }
+        for part in parts.get(group, ()):
+            for name, size in zip(part.names, part.sizes, strict=True):
+                if column < size:
+                    return f"{part.where}.{name}"
+                column -= size
+        return None
+
     def _assemble(self, view: View) -> TensorDict:
         """Collect the groups in new tensors: the learner keeps them while the physics goes on."""
         task = view.task

@@ -11,6 +11,7 @@ from tensordict import TensorDict
 
 from kiras_rl import interfaces as names
 from kiras_rl.envs import commands, curriculum, randomization, terminations
+from kiras_rl.envs.bounds import broken
 from kiras_rl.envs.commands import TaskSampler
 from kiras_rl.envs.curriculum import Curriculum
 from kiras_rl.envs.description import describe_deployment
@@ -32,9 +33,11 @@ from kiras_rl.envs.terrain_library import build_library
 from kiras_rl.envs.terrains import CROSSED
 from kiras_rl.interfaces import Measurements, SkillEnv
 from kiras_rl.recorded import Recorded, copied
+from kiras_rl.robots.identity import change, identity
 from kiras_rl.robots.robot import Robot
 from kiras_rl.schema import EnvConfig, SimConfig
 
+GRAVITY = 9.81  # m/s^2
 COMPILED = 1024  # worlds; fewer are bound by launches, which a graph takes away by itself
 KEYFRAME_COMMANDS = (0.0, 0.4, 0.8)  # of the largest v_x, for the value of a skill
 
@@ -160,6 +163,7 @@ class QuadrupedEnv(SkillEnv):
         return slots
 
     def _begin(self) -> None:
+        self._judge(~self._all, ~self._all)  # a reward of a wrong shape is refused now
         self.reset()
         if self.cfg.terminations.random_first_length:
             # Otherwise all worlds time out together, and the data of a rollout is all alike.
@@ -202,8 +206,9 @@ class QuadrupedEnv(SkillEnv):
         """Do all of a step that follows the physics."""
         self._length = self._length + 1
         self.robot.read_step()
-        invalid = self.sim.diverged | self.sim.overflowed
-        fallen = self.sim.diverged | terminations.fallen(
+        diverged = self.sim.diverged | broken(self.robot, self.keyframes, GRAVITY * self.mass)
+        invalid = diverged | self.sim.overflowed
+        fallen = diverged | terminations.fallen(
             self.robot, self.task, self.keyframes, self.cfg.terminations
         )
         distance = self._distance()
@@ -219,7 +224,7 @@ class QuadrupedEnv(SkillEnv):
             names.EXTRA_VALID: ~invalid,
             names.EXTRA_FLAT: self._is_flat,
             names.NEXT_PROPRIO: _unless(invalid, observer.proprio(view), observer.clean),
-            "log": self._log(terms, fallen, time_outs),
+            "log": self._log(terms, fallen, time_outs, diverged),
         }
         self._measurements = measure(self.robot, self._limits, distance, fallen | invalid)
 
@@ -313,13 +318,17 @@ class QuadrupedEnv(SkillEnv):
         return self._observer.observe(self._view(), self._sensors, begun, self._random)
 
     def _log(
-        self, terms: torch.Tensor, fallen: torch.Tensor, time_outs: torch.Tensor
+        self,
+        terms: torch.Tensor,
+        fallen: torch.Tensor,
+        time_outs: torch.Tensor,
+        diverged: torch.Tensor,
     ) -> dict[str, torch.Tensor]:
         means = terms.mean(dim=0).unbind()
         log = {
             f"Reward/{name}": mean for name, mean in zip(self._rewards.names, means, strict=True)
         }
-        events = torch.stack([fallen, time_outs, self.sim.diverged, self.sim.overflowed], dim=1)
+        events = torch.stack([fallen, time_outs, diverged, self.sim.overflowed], dim=1)
         counts = events.sum(dim=0, dtype=torch.float32).unbind()
         log |= zip(_EVENTS, counts, strict=True)
         return log | (self._curriculum.describe(self.skills) if self._curriculum else {})
@@ -398,6 +407,18 @@ class QuadrupedEnv(SkillEnv):
     def foot_height_b(self, gravity_b: torch.Tensor, joint_pos: torch.Tensor) -> torch.Tensor:
         """Return the height of each foot's lowest point above the base, (N, F), m."""
         return self._kinematics.foot_height_b(gravity_b, joint_pos)
+
+    def robot_identity(self) -> dict:
+        """Return what a training depends on of the robot, as plain values."""
+        return identity(self.robot_cfg)
+
+    def robot_change(self, before: dict) -> str | None:
+        """Return how the robot differs from an earlier `robot_identity`, None if it does not."""
+        return change(before, self.robot_identity())
+
+    def name_term(self, group: str, column: int) -> str:
+        """Name the term that a column of a group of observations comes from."""
+        return self._observer.name_term(group, column) or super().name_term(group, column)
 
     def keyframe_observations(self) -> torch.Tensor:
         """Return critic observations at rest in each keyframe for G commands, (S, G, C)."""

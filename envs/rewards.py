@@ -15,7 +15,7 @@ from functools import partial
 import torch
 
 from kiras_rl.config import ConfigError
-from kiras_rl.envs.lookup import find_function
+from kiras_rl.envs.lookup import evaluate, find_function
 from kiras_rl.envs.memory import remembering
 from kiras_rl.envs.state import Step
 from kiras_rl.schema import RewardConfig
@@ -254,8 +254,17 @@ class RewardSum:
         self._weights = torch.tensor(weights, device=device)
 
     def __call__(self, step: Step) -> torch.Tensor:
-        """Return the weighted terms, (N, number of terms)."""
-        return torch.stack([term(step) for term in self._terms], dim=1) * self._weights
+        """Return the weighted terms, (N, number of terms).
+
+        Raises:
+            ConfigError: A term of another shape than one number per world.
+        """
+        shape = (len(step.fallen),)
+        values = [
+            evaluate(term, step, f"env.rewards.terms.{name}", shape)
+            for name, term in zip(self.names, self._terms, strict=True)
+        ]
+        return torch.stack(values, dim=1) * self._weights
 
 
 def _bind(name: str, values: dict) -> partial[torch.Tensor]:

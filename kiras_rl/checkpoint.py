@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import pickle
 import platform
 import zipfile
@@ -12,7 +11,7 @@ from pathlib import Path
 import torch
 
 from kiras_rl import __version__, distributed
-from kiras_rl.files import replacing
+from kiras_rl.files import CheckedFile, replacing
 from kiras_rl.models.exported import ExportedPolicy, build_policy
 
 FORMAT = 3
@@ -39,16 +38,29 @@ class CheckpointError(ValueError):
 
 
 def save_checkpoint(path: Path, content: dict) -> None:
-    """Write a checkpoint; a crash at any moment leaves the old file or the new one.
+    """Write a checkpoint and read it back; whatever fails leaves the old file as it was.
 
     Args:
         path: Where to.
         content: Tensors, numbers, strings, and containers of them.
+
+    Raises:
+        OSError: The disk is full, or does not give back what was written.
     """
-    with replacing(path) as temporary, temporary.open("wb") as file:
-        torch.save({"format": FORMAT, "versions": versions()} | content, file)
-        file.flush()
-        os.fsync(file.fileno())
+    with replacing(path) as temporary, temporary.open("wb", buffering=0) as file:
+        checked = CheckedFile(file)
+        try:
+            torch.save({"format": FORMAT, "versions": versions()} | content, checked)
+            checked.check(temporary)
+        except (OSError, RuntimeError) as error:  # torch hides why its file did not take more
+            raise OSError(f"{path} was not written: {_why(error)}") from None
+
+
+def _why(error: BaseException) -> str:
+    """Return the first line of an error, or of the one behind it that the system gave."""
+    while not isinstance(error, OSError) and error.__context__ is not None:
+        error = error.__context__
+    return str(error).splitlines()[0] if str(error) else type(error).__name__
 
 
 def load_checkpoint(path: Path) -> dict:

@@ -16,6 +16,7 @@ from omegaconf.errors import OmegaConfBaseException
 from kiras_rl.files import replacing
 from kiras_rl.ranges import find_mistake
 from kiras_rl.schema import Config
+from kiras_rl.yaml_files import YamlError, read_yaml_file, read_yaml_text
 
 CFG_FOLDER = Path(__file__).resolve().parent / "cfg"
 if not CFG_FOLDER.is_dir():  # an editable install: kiras_rl.cfg is the top-level folder cfg/
@@ -140,7 +141,7 @@ def _schema() -> DictConfig:
 @cache
 def _base() -> DictConfig:
     """Return cfg/base.yaml, which is most of any configuration: to copy, never to change."""
-    return _merge(copy.deepcopy(_schema()), _read(BASE), "base")
+    return _merge(copy.deepcopy(_schema()), read_keys(BASE), "base")
 
 
 def _resolve(
@@ -171,12 +172,14 @@ def _explain(error: OmegaConfBaseException, source: str) -> str:
 
 
 def _parse_override(item: str) -> DictConfig:
-    key, separator, _ = item.partition("=")
+    key, separator, text = item.partition("=")
     if not separator or not key:
         raise ConfigError(f"'{item}' is not an override; write key=value, as in num_envs=512")
+    layer = OmegaConf.create()
     try:
-        return OmegaConf.from_dotlist([item])
-    except Exception as error:  # the YAML parser's own errors are of many kinds
+        OmegaConf.update(layer, key, read_yaml_text(text))
+        return layer
+    except (OmegaConfBaseException, ValueError) as error:
         reason = " ".join(str(error).split())
         raise ConfigError(f"override '{item}' is not readable: {reason}") from None
 
@@ -220,7 +223,7 @@ def _read_chain(name: str) -> tuple[DictConfig, list[dict]]:
         if path == BASE:
             return _base(), layers[::-1]
         seen.append(path)
-        values = _read(path)
+        values = read_keys(path)
         current = values.pop("extends", None)
         if not isinstance(current, str | None):
             raise ConfigError(f"{path}: extends: give one name, not {current}")
@@ -228,12 +231,16 @@ def _read_chain(name: str) -> tuple[DictConfig, list[dict]]:
     return _schema(), layers[::-1]
 
 
-def _read(path: Path) -> dict:
+def read_keys(path: Path) -> dict:
+    """Return the mapping that a YAML file holds.
+
+    Raises:
+        ConfigError: It cannot be read, or holds something else.
+    """
     try:
-        values = OmegaConf.to_container(OmegaConf.load(path))
-    except Exception as error:
-        reason = " ".join(str(error).split())
-        raise ConfigError(f"{path} is not readable YAML: {reason}") from None
+        values = read_yaml_file(path)
+    except (OSError, YamlError) as error:
+        raise ConfigError(f"{path} is not readable YAML: {error}") from None
     if not isinstance(values, dict):
         raise ConfigError(f"{path} holds no keys: a configuration is a YAML mapping")
     return values

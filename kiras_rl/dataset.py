@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
+import tempfile
 import zipfile
 import zlib
 from collections.abc import Sequence
@@ -182,7 +183,7 @@ def load_dataset(path: str | Path) -> Dataset:
 
 
 def save_dataset(dataset: Dataset, path: str | Path, formats: Sequence[str] = ("npz",)) -> None:
-    """Write a dataset as a folder, which appears only when it is whole.
+    """Write a dataset as a folder, which is one only when it is whole: its description comes last.
 
     Args:
         dataset: What to write.
@@ -194,8 +195,10 @@ def save_dataset(dataset: Dataset, path: str | Path, formats: Sequence[str] = ("
     """
     check_target(path, formats)
     folder = Path(path).resolve()
-    temporary = folder.with_name(f".{folder.name}.{os.getpid()}.tmp")  # beside: a rename is atomic
-    temporary.mkdir(parents=True)
+    is_new = not folder.exists()
+    folder.mkdir(parents=True, exist_ok=True)
+    temporary = folder / f".{os.getpid()}.tmp"  # within: the folder may be another disk, mounted
+    temporary.mkdir()
     try:
         _write_header(dataset, temporary / HEADER)
         if "npz" in formats:
@@ -205,22 +208,27 @@ def save_dataset(dataset: Dataset, path: str | Path, formats: Sequence[str] = ("
             from kiras_rl import lerobot
 
             lerobot.write(dataset, temporary)
-        os.replace(temporary, folder)
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
+    except BaseException:
+        shutil.rmtree(folder if is_new else temporary, ignore_errors=True)
+        raise
+    for part in sorted(temporary.iterdir(), key=lambda part: part.name == HEADER):
+        part.replace(folder / part.name)
+    temporary.rmdir()
 
 
 def check_target(path: str | Path, formats: Sequence[str]) -> None:
-    """Check that a dataset can be written to a folder.
+    """Check that a dataset can be written to a folder, and leave everything as it is.
 
     Raises:
-        DatasetError: If something is there already, or a format is unknown or needs a package.
+        DatasetError: If something is there already, nothing can be written there, or a format is
+            unknown or needs a package.
     """
     folder = Path(path)
     if folder.is_dir() and any(folder.iterdir()):
         raise DatasetError(f"{folder} holds files, which are not overwritten: name a new folder")
     if folder.exists() and not folder.is_dir():
         raise DatasetError(f"{folder} is a file, which is not overwritten: name a new folder")
+    _try_to_write(folder)
     unknown = [name for name in formats if name not in FORMATS]
     if unknown or not formats:
         given = ", ".join(unknown) or "none"
@@ -229,6 +237,16 @@ def check_target(path: str | Path, formats: Sequence[str]) -> None:
         from kiras_rl import lerobot
 
         lerobot.require_pyarrow()
+
+
+def _try_to_write(folder: Path) -> None:
+    """Write a file where the dataset will lie, or in the first folder above that there is."""
+    place = next(path for path in (folder.absolute(), *folder.absolute().parents) if path.exists())
+    try:
+        with tempfile.NamedTemporaryFile(dir=place) as file:
+            file.write(b"x" * 4096)
+    except OSError as error:
+        raise DatasetError(f"{folder}: nothing can be written there ({error.strerror})") from None
 
 
 def _check_shape(name: str, array: np.ndarray, shape: tuple[int, ...]) -> None:

@@ -6,7 +6,7 @@ import copy
 import logging
 import warnings
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
@@ -23,7 +23,8 @@ if TYPE_CHECKING:
 
 MAX_BYTES = 500_000  # what an onboard computer copies and loads in no time; our networks need half
 MAX_DIFFERENCE = 1e-4  # between torch and onnxruntime, in units of the action
-_OPSET = 18
+_OPSET = 18  # of the exporter
+_LEAST_OPSET = 13  # which onnxruntime runs from version 1.6 on
 
 
 class ExportError(ValueError):
@@ -101,6 +102,7 @@ def _example(metadata: PolicyMetadata, count: int = 2) -> tuple[torch.Tensor, to
 def _serialize(policy: nn.Module, metadata: PolicyMetadata) -> bytes:
     model = _trace(policy, metadata)
     _strip_debug_information(model)
+    _lower_versions(model)
     entry = model.metadata_props.add()
     entry.key, entry.value = METADATA_KEY, metadata.to_json()
     data = model.SerializeToString()
@@ -153,6 +155,22 @@ def _strip_debug_information(model: onnx.ModelProto) -> None:
     for tensor in graph.initializer:
         del tensor.metadata_props[:]
         tensor.doc_string = ""
+
+
+def _lower_versions(model: onnx.ModelProto) -> None:
+    """Ask for the lowest versions that carry the graph: a robot's onnxruntime may be an old one.
+
+    What the operators mean is the same in all of them; the comparison with torch follows.
+    """
+    import onnx
+
+    (operators,) = model.opset_import
+    for version in range(_LEAST_OPSET, operators.version + 1):
+        operators.version = version
+        model.ir_version = onnx.helper.find_min_ir_version_for(model.opset_import)
+        with suppress(onnx.checker.ValidationError, onnx.shape_inference.InferenceError):
+            onnx.checker.check_model(model, full_check=True)
+            return
 
 
 def _largest_difference(

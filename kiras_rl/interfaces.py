@@ -215,6 +215,18 @@ class SkillEnv(VecEnv):
             Observations for G commands spread over the command range, (S, G, C).
         """
 
+    def robot_identity(self) -> dict:
+        """Return what a training depends on of the robot, as plain values."""
+        return {}
+
+    def robot_change(self, before: dict) -> str | None:
+        """Return how the robot differs from an earlier `robot_identity`, None if it does not."""
+        return None
+
+    def name_term(self, group: str, column: int) -> str:
+        """Name what a column of a group of observations comes from, for messages."""
+        return f"column {column} of observation group {group}"
+
     @abstractmethod
     def measure(self) -> Measurements:
         """Return the measurements of the last step."""

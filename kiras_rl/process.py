@@ -10,21 +10,28 @@ import torch
 
 from kiras_rl import distributed
 
+ENDS = (signal.SIGHUP, signal.SIGINT, signal.SIGTERM)
+"""Signals that ask a training to save and end; a closed output raises the first one."""
+
 
 class StopRequest:
-    """Turns SIGINT and SIGTERM into a flag while the context is open."""
+    """Turns the signals of ENDS into a flag while the context is open."""
 
     def __enter__(self) -> StopRequest:
         """Install the handlers; outside the main thread there are none to install."""
         self.requested = False
         self._old = {}
         with suppress(ValueError):
-            for number in (signal.SIGINT, signal.SIGTERM):
+            for number in ENDS:
+                if number == signal.SIGHUP and signal.getsignal(number) is signal.SIG_IGN:
+                    continue  # nohup wants to go on
                 self._old[number] = signal.signal(number, self._request)
         return self
 
     def _request(self, number: int, frame: object) -> None:
         self.requested = True
+        if number == signal.SIGHUP:  # comes again for every line that nobody can read any more
+            return
         if distributed.size() == 1:  # torchrun passes Ctrl-C on, which the terminal gave all before
             signal.signal(number, self._old[number])  # a second one acts at once
 

@@ -6,66 +6,8 @@ import math
 from collections.abc import Iterable, Iterator
 from typing import Any
 
+from kiras_rl.limits import SCHEDULES, find_outside
 from kiras_rl.schedules import piecewise_linear
-
-POSITIVE = (
-    "num_envs",
-    "iterations",
-    "sim.timestep",
-    "sim.substeps",
-    "env.observations.history_length",
-    "env.terminations.episode_length",
-    "env.randomization.push_interval",
-    "env.terrain.levels",
-    "env.terrain.variants",
-    "env.terrain.scale",
-    "env.terrain.cell",
-    "learner.ppo.num_steps",
-    "learner.ppo.num_epochs",
-    "learner.ppo.num_mini_batches",
-    "learner.imitation.discriminator.updates",
-    "learner.imitation.discriminator.batch_size",
-    "learner.imitation.premium.capacity",
-    "learner.imitation.premium.per_iteration",
-    "learner.estimator.epochs",
-    "evaluation.worlds_per_skill",
-    "evaluation.terrain.robots",
-    "finetuning.iterations",
-    "learner.ppo.actor_dims",
-    "learner.ppo.critic_dims",
-    "learner.imitation.discriminator.hidden_dims",
-    "learner.estimator.encoder_dims",
-    "learner.estimator.decoder_dims",
-)
-"""Of a list every number."""
-
-NOT_NEGATIVE = (
-    "env.randomization.friction",
-    "env.randomization.kp_factor",
-    "env.randomization.kd_factor",
-    "env.randomization.motor_factor",
-    "env.randomization.torque_factor",
-    "env.randomization.leg_mass_factor",
-    "env.randomization.joint_friction_factor",
-    "env.randomization.joint_damping_factor",
-    "env.randomization.observation_delay",
-    "env.randomization.action_delay",
-    "learner.ppo.learning_rate",  # at 0 a part does not learn
-    "learner.ppo.learning_rate_range",
-    "learner.imitation.discriminator.learning_rate",
-    "learner.estimator.relative_step",
-    "learner.estimator.latent_dim",  # at 0 the context is the velocity alone
-)
-"""Of a list every number."""
-
-_LARGEST_SEED = 2**63 - 1  # torch takes one bit more, which leaves room for the number of a rank
-
-LIMITS = {
-    "seed": (0, _LARGEST_SEED),
-    "env.terrain.seed": (0, _LARGEST_SEED),
-    "learner.skill_init.floor": (0, 1),  # what S skills can have is checked with them
-}
-"""The least and the largest value."""
 
 RANGES = (
     "env.commands.lin_vel_x",
@@ -103,12 +45,6 @@ TERMS = {
 }
 """Lists of terms, and the keys that hold a number in each of their entries."""
 
-SCHEDULES = (
-    "learner.ppo.action_std",
-    "learner.ppo.desired_kl",
-    "learner.imitation.discriminator.noise",
-)
-
 
 def find_mistake(values: dict) -> str | None:
     """Return what is wrong with the values of a whole configuration, or None.
@@ -121,12 +57,12 @@ def find_mistake(values: dict) -> str | None:
     """
     checks = (
         _find_infinite,  # what the others compare is finite
-        _find_outside,
         _find_disorder,
-        _find_silence,
+        find_outside,
         _find_empty,
         _find_no_number,
         _find_large_batches,
+        _find_short_episodes,
     )
     return next((mistake for check in checks if (mistake := check(values))), None)
 
@@ -138,20 +74,6 @@ def _find_infinite(values: dict) -> str | None:
     return None
 
 
-def _find_outside(values: dict) -> str | None:
-    for key, value in _given(values, POSITIVE):
-        if not all(x > 0 for x in _scalars(value)):
-            return f"{key}={value}: must be positive"
-    for key, value in _given(values, NOT_NEGATIVE):
-        if not all(x >= 0 for x in _scalars(value)):
-            return f"{key}={value}: must not be negative"
-    for key, value in _given(values, LIMITS):
-        low, high = LIMITS[key]
-        if not low <= value <= high:
-            return f"{key}={value}: allowed are {low} to {high}"
-    return None
-
-
 def _find_disorder(values: dict) -> str | None:
     for key, (low, high) in _given(values, RANGES):
         if low > high:
@@ -159,13 +81,6 @@ def _find_disorder(values: dict) -> str | None:
     for key, value in _given(values, SCHEDULES):
         if not _is_schedule(value):
             return f"{key}={value}: give [fraction of T1, value] points in ascending order"
-    return None
-
-
-def _find_silence(values: dict) -> str | None:
-    noise = values["learner"]["ppo"]["action_std"]
-    if not all(std > 0 for _, std in noise):
-        return f"learner.ppo.action_std={noise}: every value must be positive"
     return None
 
 
@@ -197,6 +112,17 @@ def _find_large_batches(values: dict) -> str | None:
         return (
             f"learner.ppo.num_mini_batches={batches}: at most the {steps} steps of a rollout "
             "(num_envs * learner.ppo.num_steps)"
+        )
+    return None
+
+
+def _find_short_episodes(values: dict) -> str | None:
+    length, sim = values["env"]["terminations"]["episode_length"], values["sim"]
+    step = sim["timestep"] * sim["substeps"]
+    if length < step:
+        return (
+            f"env.terminations.episode_length={length}: at least the {step:g} s of a control step "
+            "(sim.timestep * sim.substeps)"
         )
     return None
 

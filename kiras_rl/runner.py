@@ -96,6 +96,7 @@ class KirasRunner(OnPolicyRunner):
         self.best_networks: dict | None = None
         self.seconds, self.steps = 0.0, 0  # of training, over all phases and resumes
         self.begun_from: str | None = None  # another run's checkpoint that finetuning began with
+        self.takes_changed_robot = False
         self._writer: SummaryWriter | None = None
         self._resumed = False
         self._last_saved = time.monotonic()
@@ -211,9 +212,10 @@ class KirasRunner(OnPolicyRunner):
                 log = extras["log"]  # the same names in every step
                 totals = totals + torch.stack(tuple(log.values())) if log else totals
         self.alg.compute_returns(obs)
-        check_rollout(obs, self.alg.storage)
         values = zip(log, totals.tolist(), strict=True) if log else ()
-        return {k: v if k.startswith(COUNTS) else v / num_steps for k, v in values}
+        means = {k: v if k.startswith(COUNTS) else v / num_steps for k, v in values}
+        check_rollout(obs, self.alg.storage, means, self.env.name_term)
+        return means
 
     def _renew_skill_probabilities(self, scalars: dict[str, float]) -> None:
         probabilities = self.alg.skill_probabilities(self.env.keyframe_observations())
@@ -301,6 +303,7 @@ class KirasRunner(OnPolicyRunner):
             "config": config_to_dict(self.config),
             "phase": self.phase,
             "skills": list(self.env.skills),
+            "robot": self.env.robot_identity(),
             "iteration": self.current_learning_iteration,
             "seconds": self.seconds,
             "best_score": self.best_score,
@@ -337,7 +340,7 @@ class KirasRunner(OnPolicyRunner):
         With another number of ranks, worlds begin anew.
 
         Raises:
-            CheckpointError: Unusable file, or one of other skills.
+            CheckpointError: Unusable file, or one of other skills or of another robot.
         """
         fresh = self.alg.world_state()
         content, own = self._read(path)
@@ -387,5 +390,11 @@ class KirasRunner(OnPolicyRunner):
             raise checkpoint.CheckpointError(
                 f"{path} was trained on the skills {', '.join(content['skills'])}; the robot has "
                 f"{', '.join(self.env.skills)}: mend its keyframes.yaml or start a new run"
+            )
+        changed = self.env.robot_change(content.get("robot", {}))
+        if changed and not self.takes_changed_robot:
+            raise checkpoint.CheckpointError(
+                f"{path} was trained on another {self.config.robot}: {changed}; undo the change in "
+                "the robot's folder, start a new run, or go on with --changed-robot"
             )
         return content, own

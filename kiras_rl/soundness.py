@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
+import torch
 from rsl_rl.storage import RolloutStorage
 from rsl_rl.utils import check_nan
 from tensordict import TensorDict
 
 from kiras_rl import distributed
 
+NameTerm = Callable[[str, int], str]
 LOSSES = ("Loss/", "Policy/", "Estimator/", "Discriminator/")
 """Tags of an update that are numbers as long as its weights are."""
 
@@ -18,11 +21,19 @@ class TrainingError(ValueError):
     """A training that cannot go on: says where it broke and what is left."""
 
 
-def check_rollout(obs: TensorDict, storage: RolloutStorage) -> None:
+def check_rollout(
+    obs: TensorDict, storage: RolloutStorage, log: dict[str, float], name: NameTerm
+) -> None:
     """Refuse observations, rewards or dones that are not finite.
 
     Once a rollout, for every check waits for the device: NaN in an earlier step is still there, in
     the history of observations or in rewards, which hold values of time-outs.
+
+    Args:
+        obs: The last observations.
+        storage: The rollout.
+        log: Of the environment; it names the terms of the reward.
+        name: Names the term that a column of a group of observations comes from.
 
     Raises:
         TrainingError: On all ranks, where one met them.
@@ -31,8 +42,17 @@ def check_rollout(obs: TensorDict, storage: RolloutStorage) -> None:
     try:
         check_nan(obs, storage.rewards, storage.dones)
     except ValueError as error:
-        fault = str(error)
+        terms = _broken_terms(obs, log, name)
+        fault = f"not finite: {', '.join(terms)}." if terms else str(error)
     _agree(fault, "Worlds that diverge are reset before this, so look at your own terms")
+
+
+def _broken_terms(obs: TensorDict, log: dict[str, float], name: NameTerm) -> list[str]:
+    terms = [k for k, v in log.items() if k.startswith("Reward/") and not math.isfinite(v)]
+    for group, values in obs.items():
+        columns = (~torch.isfinite(values)).reshape(len(values), -1).any(dim=0).nonzero().flatten()
+        terms += [name(str(group), int(column)) for column in columns]
+    return list(dict.fromkeys(terms))
 
 
 def check_update(scalars: dict[str, float]) -> None:

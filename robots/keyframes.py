@@ -14,6 +14,7 @@ from kiras_rl.robots.kinematics import KNEES, Leg, LegError, ReachError, find_le
 from kiras_rl.robots.reading import (
     RobotError,
     check_keys,
+    check_name,
     frozen,
     hint,
     number,
@@ -81,6 +82,7 @@ class KeyframeReader:
 
     def _keyframe(self, name: str, entry: Any) -> Keyframe:
         where = f"keyframe {name!r} of {self.robot} ({self.path})"
+        check_name(name, "keyframe", str(self.path))
         if not isinstance(entry, dict):
             raise RobotError(f"{where} must hold {', '.join(_KEYS)}, not {entry!r}")
         check_keys(entry, _KEYS, required=("base_height", "pitch"), where=where)

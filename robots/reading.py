@@ -4,12 +4,27 @@ from __future__ import annotations
 
 import difflib
 import fnmatch
+import re
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
+
+from kiras_rl.yaml_files import YamlError, read_yaml_file
+
+RANGES = {
+    "kp": (0.0, np.inf, True),
+    "kd": (0.0, np.inf, False),
+    "torque_limit": (0.0, np.inf, True),
+    "velocity_limit": (0.0, np.inf, True),
+    "stall_torque": (0.0, np.inf, True),
+    "no_load_speed": (0.0, np.inf, True),
+    "action_scale": (0.0, np.inf, True),
+    "base_height": (0.0, np.inf, True),
+    "pitch": (-89.0, 89.0, False),
+}
+"""Of a key's numbers: least, largest, and whether the least itself is too little."""
 
 
 class RobotError(ValueError):
@@ -23,17 +38,19 @@ def hint(name: object, allowed: Iterable[str]) -> str:
 
 
 def read_yaml(path: Path) -> dict[str, Any]:
-    """Return the mapping in a YAML file.
+    """Return the mapping in a YAML file, read as configurations are.
 
     Raises:
         RobotError: if the file is missing, is not YAML or holds no mapping.
     """
     try:
-        entries = yaml.safe_load(path.read_text(encoding="utf-8"))
+        entries = read_yaml_file(path)
     except FileNotFoundError as error:
         raise RobotError(f"{path} is missing") from error
-    except yaml.YAMLError as error:
-        raise RobotError(f"{path} is not valid YAML: {' '.join(str(error).split())}") from error
+    except OSError as error:
+        raise RobotError(f"{path} cannot be read: {error.strerror}") from error
+    except YamlError as error:
+        raise RobotError(f"{path} is not valid YAML: {error}") from error
     if not isinstance(entries, dict) or not entries:
         raise RobotError(f"{path} must hold `name: value` entries")
     return entries
@@ -58,14 +75,38 @@ def check_keys(
 
 
 def number(value: object, what: str, where: str) -> float:
-    """Return a finite number.
+    """Return a finite number, within the range of RANGES where `what` has one.
 
     Raises:
         RobotError: if it is something else.
     """
     if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(value):
         raise RobotError(f"{what} must be a number, not {value!r}, in {where}")
+    low, high, open_below = RANGES.get(what, (-np.inf, np.inf, False))
+    if not low <= value <= high or (open_below and value == low):
+        raise RobotError(
+            f"{what} must be {_range(low, high, open_below)}, not {value!r}, in {where}"
+        )
     return float(value)
+
+
+def _range(low: float, high: float, open_below: bool) -> str:
+    if high < np.inf:
+        return f"between {low:g} and {high:g}"
+    return f"above {low:g}" if open_below else f"at least {low:g}"
+
+
+def check_name(name: str, what: str, where: str) -> None:
+    """Refuse a name that commands, tables, logs and files cannot carry.
+
+    Raises:
+        RobotError: naming what is allowed.
+    """
+    if not re.fullmatch(r"[A-Za-z_][A-Za-z0-9_.-]*", name):
+        raise RobotError(
+            f"{what} {name!r}: a name has letters, digits, _ . and -, and begins with a "
+            f"letter or _ ({where})"
+        )
 
 
 def per_name(key: str, value: object, names: tuple[str, ...], where: str) -> np.ndarray:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
-from xml.sax.saxutils import quoteattr
 
 import mujoco
 import numpy as np
@@ -22,13 +21,14 @@ from kiras_rl.robots.reading import (
     ranges_per_name,
     read_yaml,
 )
+from kiras_rl.robots.rules import VISUAL_GROUP, check_named_parts, load_mjcf
+from kiras_rl.robots.scene import put_into_scene
 
 __all__ = ["ROBOTS", "Keyframe", "Robot", "RobotError", "list_robots", "load_robot"]
 
 ROBOTS = Path(__file__).parent
 """The folder that holds one folder a robot."""
 
-_VISUAL_GROUP = 2
 _POSITION = int(mujoco.mjtCtrlInput.mjINPUT_POS)
 
 _KEYS = (
@@ -145,7 +145,7 @@ class Robot:
             visuals: keep the geoms that are only looked at. Without them a physics step is
                 faster and the physics is the same.
         """
-        spec = _scene_spec(self.folder)
+        spec = put_into_scene(self.mjcf)
         for j, joint in enumerate(self.joint_names):
             actuator = spec.add_actuator(
                 name=joint, target=joint, trntype=mujoco.mjtTrn.mjTRN_JOINT
@@ -154,7 +154,7 @@ class Robot:
             limit = float(self.torque_limit[j])
             actuator.forcerange = (-limit, limit)
         if not visuals:
-            for geom in [geom for geom in spec.geoms if geom.group == _VISUAL_GROUP]:
+            for geom in [geom for geom in spec.geoms if geom.group == VISUAL_GROUP]:
                 spec.delete(geom)
         return spec
 
@@ -177,7 +177,7 @@ def load_robot(name: str, root: Path = ROBOTS) -> Robot:
     Raises:
         RobotError: if the robot is unknown, or one of its files is wrong.
     """
-    base, _, variant = name.partition(_VARIANT)
+    base, _, variant = str(name).partition(_VARIANT)
     if base not in list_robots(root):
         raise RobotError(
             f"there is no robot {base!r}{hint(base, list_robots(root))}; "
@@ -187,7 +187,7 @@ def load_robot(name: str, root: Path = ROBOTS) -> Robot:
     where = str(folder / "robot.yaml")
     entries = _with_variant(read_yaml(folder / "robot.yaml"), name, variant, where)
     check_keys(entries, _KEYS + _OPTIONAL_KEYS, required=_KEYS, where=where)
-    model = _robot_model(folder)
+    model = load_mjcf(_mjcf(folder))
     parts = _named_parts(entries, model, where)
     joints = parts["joint_names"]
     joint_limits = _joint_limits(entries.get("joint_limits"), model, joints, where)
@@ -285,33 +285,9 @@ def _mjcf(folder: Path) -> Path:
     return folder / f"{folder.name}.xml"
 
 
-def _scene_spec(folder: Path) -> mujoco.MjSpec:
-    """Join scene.xml and the robot's MJCF into one document.
-
-    Including keeps all names as they are; attaching without a prefix makes MuJoCo warn.
-    """
-    files = (ROBOTS / "scene.xml", _mjcf(folder))
-    includes = "".join(f"<include file={quoteattr(str(file))}/>" for file in files)
-    spec = mujoco.MjSpec.from_string(f"<mujoco model={quoteattr(folder.name)}>{includes}</mujoco>")
-    spec.modelfiledir = str(folder)
-    return spec
-
-
-def _robot_model(folder: Path) -> mujoco.MjModel:
-    """Compile the robot alone, which is ten times faster than with its scene."""
-    if not _mjcf(folder).is_file():
-        raise RobotError(f"robot {folder.name!r} has no MJCF: {_mjcf(folder)} is missing")
-    try:
-        return mujoco.MjModel.from_xml_path(str(_mjcf(folder)))
-    except ValueError as error:
-        raise RobotError(f"{_mjcf(folder)}: {' '.join(str(error).split())}") from error
-
-
 def _named_parts(entries: dict[str, Any], model: mujoco.MjModel, where: str) -> dict[str, Any]:
     """Check the joints, body and geoms that robot.yaml names against the MJCF."""
     joints = [model.joint(i).name for i in range(model.njnt)][1:]  # 0 is the free joint
-    if model.njnt == 0 or model.jnt_type[0] != mujoco.mjtJoint.mjJNT_FREE:
-        raise RobotError(f"the first joint of the MJCF must be free ({where})")
     if entries["joints"] != joints:
         raise RobotError(
             f"joints must be in the MJCF's order [{', '.join(joints)}], "
@@ -319,14 +295,13 @@ def _named_parts(entries: dict[str, Any], model: mujoco.MjModel, where: str) -> 
         )
     bodies = [model.body(i).name for i in range(1, model.nbody)]
     geoms = [name for name in (model.geom(i).name for i in range(model.ngeom)) if name]
-    return {
-        "joint_names": tuple(joints),
-        "base_body": matching("base_body", [entries["base_body"]], bodies, where)[0],
-        **{
-            key: matching(key, entries[key], geoms, where)
-            for key in ("base_geoms", "penalised_geoms", "foot_geoms")
-        },
+    base = matching("base_body", [entries["base_body"]], bodies, where)[0]
+    named = {
+        key: matching(key, entries[key], geoms, where)
+        for key in ("base_geoms", "penalised_geoms", "foot_geoms")
     }
+    check_named_parts(model, Path(where), base, named["foot_geoms"], sum(named.values(), ()))
+    return {"joint_names": tuple(joints), "base_body": base, **named}
 
 
 def _read_keyframes(
@@ -344,11 +319,7 @@ def _read_keyframes(
 
 
 def _foot_radius(model: mujoco.MjModel, feet: tuple[str, ...]) -> float:
-    radii = {float(model.geom(foot).size[0]) for foot in feet}
-    types = {int(model.geom(foot).type[0]) for foot in feet}
-    if len(radii) != 1 or types != {int(mujoco.mjtGeom.mjGEOM_SPHERE)}:
-        raise RobotError(f"foot_geoms {', '.join(feet)} must be spheres of one size in the MJCF")
-    return radii.pop()
+    return float(model.geom(feet[0]).size[0])
 
 
 def _default_pose(

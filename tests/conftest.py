@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 
 import pytest
 import torch
@@ -47,6 +48,25 @@ def taped(monkeypatch):
     """Let a CPU record what a GPU would: torch.cuda's graphs are stand-ins."""
     monkeypatch.setattr(torch.cuda, "CUDAGraph", Tape)
     monkeypatch.setattr(torch.cuda, "graph", lambda tape: tape)
+
+
+@pytest.fixture
+def edit_text(tmp_path):
+    """Return a function that changes the text of one file of a copied Solo-8 and loads the copy."""
+    from kiras_rl.robots.robot import ROBOTS, load_robot
+
+    def change(file, edit, name="solo8"):
+        folder = shutil.copytree(ROBOTS / "solo8", tmp_path / "robots" / name, dirs_exist_ok=True)
+        for other in ("robot.yaml", "keyframes.yaml", "solo8.xml"):
+            shutil.copy(ROBOTS / "solo8" / other, folder)
+        text = edit((folder / file).read_text(encoding="utf-8"))
+        data = text if isinstance(text, bytes) else text.encode()
+        (folder / file).write_bytes(data)
+        if name != "solo8":
+            (folder / "solo8.xml").rename(folder / f"{name}.xml")
+        return load_robot(name, root=tmp_path / "robots")
+
+    return change
 
 
 @pytest.fixture(scope="session")

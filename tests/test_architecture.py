@@ -43,11 +43,15 @@ RULES = {  # the longest name that fits a module counts
     "kiras_rl.config": LEARNING._replace(may=(*LEARNING.may, "omegaconf")),
     "kiras_rl.evaluation.dtw": LEARNING._replace(may=(*LEARNING.may, "dtaidistance")),
     "kiras_rl.export": LEARNING._replace(may=(*LEARNING.may, "onnxruntime")),  # the parity check
+    "kiras_rl.graphics": Rule(("mujoco",)),
+    "kiras_rl.ownership": LEARNING._replace(may=(*LEARNING.may, "filelock")),
     "kiras_rl.recorded": Rule(("torch",)),
     "kiras_rl.dataset": Rule(("numpy", "kiras_rl.lerobot")),
     "kiras_rl.lerobot": Rule(("numpy", "pyarrow", "kiras_rl.dataset")),
     "kiras_rl.deploy": Rule(("numpy", "onnxruntime", "kiras_rl.deploy")),
-    "kiras_rl.robots": Rule(("numpy", "mujoco", "yaml", "kiras_rl.robots")),
+    "kiras_rl.robots": Rule(
+        ("numpy", "mujoco", "kiras_rl.robots", "kiras_rl.yaml_files", "kiras_rl.graphics")
+    ),
     "kiras_rl.envs": SIMULATION,
     "kiras_rl.envs.simulation.warp": Rule((*SIMULATION.may, "warp", "mujoco_warp")),
     "kiras_rl.cfg": Rule(()),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import pickle
 import re
+import resource
 
 import pytest
 import torch
@@ -141,3 +142,33 @@ def test_a_policy_is_rebuilt_from_its_shape(path, make_metadata, make_policy):
     proprio, history = torch.randn(3, frame), torch.randn(3, 4 * frame)
     for mine, its in zip(policy(proprio, history), rebuilt(proprio, history), strict=True):
         assert torch.equal(mine, its)
+
+
+def test_what_the_disk_does_not_give_back_is_found_when_it_is_written(saved, monkeypatch):
+    before = saved.read_bytes()
+    sync = os.fsync
+
+    def tear(file):
+        os.pwrite(file, b"torn", 20)
+        sync(file)
+
+    monkeypatch.setattr(os, "fsync", tear)
+    with pytest.raises(OSError, match=r"was not written: .* does not read as it was written"):
+        save_checkpoint(saved, {"learner": {"x": torch.ones(5)}})
+    assert saved.read_bytes() == before
+    assert [file.name for file in saved.parent.iterdir()] == [saved.name]
+
+
+def test_a_full_disk_is_one_line_and_leaves_the_old_file(saved):
+    before = saved.read_bytes()
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, limits[1]))  # no file may become larger
+    try:
+        with pytest.raises(OSError, match="was not written: ") as caught:
+            save_checkpoint(saved, {"learner": {"x": torch.ones(100_000)}})
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert "\n" not in str(caught.value)
+    assert "File too large" in str(caught.value)
+    assert saved.read_bytes() == before
+    assert [file.name for file in saved.parent.iterdir()] == [saved.name]

@@ -14,6 +14,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from patience import PATIENCE
 
 from kiras_rl import distributed
 from kiras_rl.checkpoint import CheckpointError, load_checkpoint, save_checkpoint
@@ -22,8 +23,6 @@ from kiras_rl.phases import FINETUNING, SKILL_LEARNING
 from kiras_rl.tools.curves import read_scalars
 from kiras_rl.tools.train import main
 from kiras_rl.tools.training import resume
-
-PATIENCE = 900.0  # s, for a machine that has much else to do
 
 
 @contextmanager

@@ -27,6 +27,12 @@ def test_the_file_computes_what_torch_computes(exported, batch):
         np.testing.assert_allclose(given, wanted, atol=1e-5)
 
 
+def test_the_file_asks_for_no_newer_runtime_than_it_needs(exported):
+    model = onnx.load(exported[2])
+    assert [operators.version for operators in model.opset_import] == [13]
+    assert model.ir_version == 7
+
+
 def test_the_report_tells_size_and_difference(make_metadata, make_policy, tmp_path):
     metadata = make_metadata()
     report = export_policy(make_policy(metadata), metadata, tmp_path / "a.onnx", check_inputs=50)

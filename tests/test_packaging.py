@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import ast
 import tomllib
 from pathlib import Path
 
 import pytest
+
+import kiras_rl
 
 ROOT = Path(__file__).parent.parent
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
@@ -46,6 +49,24 @@ def test_every_data_file_is_covered_by_a_pattern(package):
         if path.is_file() and path.suffix not in {".py", ".pyc"} and path.name[0] != "."
     }
     assert sorted(map(str, data - covered)) == []
+
+
+def test_the_onboard_part_is_of_this_version_and_of_old_pythons():
+    folder = ROOT / "onboard"
+    project = tomllib.loads((folder / "pyproject.toml").read_text(encoding="utf-8"))
+    assert project["project"]["version"] == kiras_rl.__version__
+    least = project["project"]["requires-python"].removeprefix(">=").split(".")
+    for package, place in project["tool"]["setuptools"]["package-dir"].items():
+        assert package in project["tool"]["setuptools"]["packages"]
+        files = list((folder / place).glob("*.py"))
+        assert files
+        for path in files:
+            tree = ast.parse(path.read_text("utf-8"), feature_version=(3, int(least[1])))
+            newer = [
+                node.arg for node in ast.walk(tree)
+                if isinstance(node, ast.keyword) and node.arg == "strict"
+            ]  # fmt: skip
+            assert not newer, f"{path}: zip(strict=) is of Python 3.10"
 
 
 def test_every_command_names_a_module_of_tools():

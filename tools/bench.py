@@ -37,6 +37,7 @@ from kiras_rl.tools.benchmarks import (
 )
 from kiras_rl.tools.benchmarks.request import Figures, Request
 from kiras_rl.tools.benchmarks.tables import STYLE
+from kiras_rl.tools.ending import finish
 from kiras_rl.tools.training import resolve_device
 
 DESCRIPTION = """\
@@ -108,12 +109,7 @@ console = Console()
 def main(argv: list[str] | None = None) -> int:
     """Run the command; return its exit code."""
     args = _parse(argv)
-    try:
-        bench(args)
-    except (ConfigError, PolicyError, RobotError, OSError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    return 0
+    return finish(lambda: bench(args), (ConfigError, PolicyError, RobotError))
 
 
 def _parse(argv: list[str] | None) -> argparse.Namespace:

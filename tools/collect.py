@@ -9,7 +9,6 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from rich.console import Console
 from rich.table import Table
 
 from kiras_rl.checkpoint import versions
@@ -21,6 +20,8 @@ from kiras_rl.robots.robot import RobotError
 from kiras_rl.schema import Config
 from kiras_rl.tools.arguments import at_least, seconds_above
 from kiras_rl.tools.collector import Plan, Range, collect
+from kiras_rl.tools.console import make_console
+from kiras_rl.tools.ending import finish
 from kiras_rl.tools.evaluator import (
     evaluation_physics,
     make_evaluation_env,
@@ -51,26 +52,25 @@ then, in Python:
   dataset = kiras_rl.dataset.load_dataset("walks")
 """
 
+MISTAKES = (ConfigError, DatasetError, PolicyError, RobotError)
+"""Errors whose message is all that a user needs."""
+
 MANY = ("npz", "lerobot", "both")
 
-console = Console()
+console = make_console()
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command; return its exit code."""
     args = _parse(argv)
     line = shlex.join(["kiras-collect", *(sys.argv[1:] if argv is None else argv)])
-    try:
+
+    def work() -> None:
         dataset = _collect(args, line)
-    except (ConfigError, DatasetError, PolicyError, RobotError, OSError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        print("interrupted: nothing was written", file=sys.stderr)
-        return 130
-    console.print(_summary(dataset, args.episodes))
-    console.print(f"{args.out}: {len(dataset)} frames at {dataset.rate:g} Hz", soft_wrap=True)
-    return 0
+        console.print(_summary(dataset, args.episodes))
+        console.print(f"{args.out}: {len(dataset)} frames at {dataset.rate:g} Hz", soft_wrap=True)
+
+    return finish(work, MISTAKES, stopped="interrupted: nothing was written")
 
 
 def _parse(argv: Sequence[str] | None) -> argparse.Namespace:

@@ -20,7 +20,7 @@ from kiras_rl.tools.protocols.pooling import pool
 from kiras_rl.tools.protocols.subject import Options, Subject
 from kiras_rl.tools.report.about import about_table
 from kiras_rl.tools.report.content import Section
-from kiras_rl.tools.report.files import write_report
+from kiras_rl.tools.report.files import check_page, write_report
 from kiras_rl.tools.report.terminal import as_rich
 
 DESCRIPTION = """\
@@ -93,6 +93,7 @@ def _split(source: str) -> tuple[str, Path]:
 
 def compare(methods: dict[str, list[Subject]], names: list[str] | None, out: Path) -> Path:
     """Measure what is missing and write the report after each protocol; return its page."""
+    check_page(out)
     subjects = [subject for group in methods.values() for subject in group]
     sections: list[Section] = []
     page = out

@@ -7,7 +7,6 @@ import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 
 from kiras_rl.checkpoint import CheckpointError
@@ -16,12 +15,14 @@ from kiras_rl.deploy.metadata import PolicyError
 from kiras_rl.evaluation.flat import SETTLE
 from kiras_rl.robots.robot import RobotError
 from kiras_rl.tools.arguments import at_least, seconds_above
+from kiras_rl.tools.console import make_console
+from kiras_rl.tools.ending import finish
 from kiras_rl.tools.protocols import PROTOCOLS, known
 from kiras_rl.tools.protocols.subject import Options, Subject
 from kiras_rl.tools.protocols.terrain import LEVELS
 from kiras_rl.tools.report.about import about_table
 from kiras_rl.tools.report.content import Section
-from kiras_rl.tools.report.files import write_report
+from kiras_rl.tools.report.files import check_page, write_report
 from kiras_rl.tools.report.terminal import as_rich
 from kiras_rl.tools.training import resolve_device
 
@@ -52,7 +53,7 @@ MISTAKES = (CheckpointError, ConfigError, OSError, PolicyError, RobotError)
 
 ALL = list(PROTOCOLS)
 
-console = Console()
+console = make_console()
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -67,24 +68,17 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def exit_code(work: Callable[[], object]) -> int:
-    """Do the work of a command; a mistake of the user's and Ctrl-C are one line each.
+    """Do the work of a command, see `finish`; return its exit status."""
 
-    Returns:
-        0 where it was done, 2 after a mistake, 130 after Ctrl-C.
-    """
-    try:
+    def measure_and_write() -> None:
         work()
-    except MISTAKES as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        print("stopped; the same command goes on from here", file=sys.stderr)
-        return 130
-    return 0
+
+    return finish(measure_and_write, MISTAKES, "stopped; the same command goes on from here")
 
 
 def evaluate(subject: Subject, names: list[str]) -> Path:
     """Run protocols, print their tables and write the report after each; return its page."""
+    check_page(subject.folder)
     sections: list[Section] = []
     page = subject.folder
     for name, values in measure([subject], names):

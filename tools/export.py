@@ -9,11 +9,13 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from rich.console import Console
 from rich.table import Table
 
 from kiras_rl.deploy.policy import OnboardPolicy, PolicyError, PolicyMetadata
 from kiras_rl.tools import policy_files
+from kiras_rl.tools.console import make_console
+from kiras_rl.tools.ending import finish
+from kiras_rl.tools.outputs import OutputError, check_output
 
 _DESCRIPTION = """\
 Write the policy of a training run as one ONNX file with everything a robot needs: network, joint
@@ -47,15 +49,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("source", type=Path, metavar="RUN|CHECKPOINT", help="what to export")
     parser.add_argument("--out", type=Path, metavar="FILE", help="file to write")
     options = parser.parse_args(arguments)
-    try:
-        _export(options.source, options.out)
-    except (PolicyError, OSError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    return 0
+    return finish(lambda: _export(options.source, options.out), (PolicyError,))
 
 
 def _export(source: Path, out: Path | None) -> None:
+    if out:
+        _check_place(out)
     checkpoint = policy_files.find_checkpoint(source)
     beside = source / "policy.onnx" if source.is_dir() else source.with_suffix(".onnx")
     report = policy_files.export_checkpoint(checkpoint, out or beside)
@@ -71,7 +70,24 @@ def _export(source: Path, out: Path | None) -> None:
     table.add_row("latency", f"{median:.3f} ms median, {slowest:.3f} ms p99, one thread")
     for name, text in _describe(policy.metadata):
         table.add_row(name, text)
-    Console().print(table)
+    make_console().print(table)
+
+
+def _check_place(path: Path) -> None:
+    """Refuse the place of anything but a policy file.
+
+    Raises:
+        OutputError: There is something else.
+    """
+    try:
+        if path.is_file():
+            OnboardPolicy(path)
+        else:
+            check_output(path, "kiras-export")
+    except PolicyError:
+        raise OutputError(
+            f"{path} is there and is no policy file: name another file, or remove it"
+        ) from None
 
 
 def _step_times(policy: OnboardPolicy) -> np.ndarray:

@@ -15,8 +15,12 @@ from matplotlib.figure import Figure
 from PIL import Image, ImageDraw, ImageFont
 
 from kiras_rl.tools.ground import GROUND_GROUP
+from kiras_rl.tools.outputs import check_output, save_figure
 from kiras_rl.tools.rendering import RenderError, make_renderer
 from kiras_rl.tools.script import Trace
+
+STRIPS, VIDEO = "kiras-play --frames", "kiras-play --video"
+"""What the files carry as the name of their writer."""
 
 FRAMES = 8  # pictures in a strip
 STRIP_SECONDS = 1.0
@@ -109,8 +113,7 @@ def save_strips(trace: Trace, model: mujoco.MjModel, tallest: float, path: Path)
                     f"{trace.time[index] - trace.time[row[0]]:.2f} s", fontsize=7, labelpad=2
                 )
             line[0].set_ylabel(_label(trace, row[0]), fontsize=9)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=_DPI)
+    save_figure(figure, path, STRIPS, dpi=_DPI)
 
 
 def save_video(trace: Trace, model: mujoco.MjModel, tallest: float, path: Path) -> None:
@@ -178,8 +181,9 @@ def _video_writer(path: Path, rate: float) -> Iterator[Any]:
         import imageio_ffmpeg  # noqa: F401  imageio finds it by itself
     except ImportError:
         raise RenderError("videos need one more package: pip install kiras-rl[video]") from None
-    path.parent.mkdir(parents=True, exist_ok=True)
-    writer = imageio.get_writer(path, fps=rate, macro_block_size=1, quality=8)
+    check_output(path, VIDEO)
+    about = ["-metadata", f"comment={VIDEO}"]
+    writer = imageio.get_writer(path, fps=rate, macro_block_size=1, quality=8, output_params=about)
     try:
         yield writer
     finally:

@@ -13,13 +13,17 @@ import mujoco
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from rich.console import Console
 from rich.table import Table
 
 from kiras_rl.robots.robot import Keyframe, Robot, RobotError, load_robot
 from kiras_rl.robots.statics import KeyframeReport, examine_keyframe
 from kiras_rl.tools.arguments import PICTURES, file_of
+from kiras_rl.tools.console import make_console
+from kiras_rl.tools.ending import finish
+from kiras_rl.tools.outputs import check_output, save_figure
 from kiras_rl.tools.rendering import RenderError, make_renderer
+
+WRITER = "kiras-keyframes"
 
 TILE = (420, 340)
 """Width and height of one pose in pixels."""
@@ -38,19 +42,19 @@ def main(argv: list[str] | None = None) -> int:
         "--out", type=file_of(PICTURES), help="picture (default: runs/keyframes/ROBOT.png)"
     )
     arguments = parser.parse_args(argv)
-    try:
-        robot = load_robot(arguments.robot)
-    except RobotError as error:
-        return _fail(str(error))
+    return finish(lambda: _show(arguments.robot, arguments.out), (RobotError,))
+
+
+def _show(name: str, out: Path | None) -> int:
+    if out:
+        check_output(out, WRITER)
+    robot = load_robot(name)
     reports = [examine_keyframe(robot, keyframe) for keyframe in robot.keyframes]
-    Console().print(make_table(robot, reports))
+    make_console().print(make_table(robot, reports))
     problems = [problem for report in reports if (problem := report.problem())]
     for problem in problems:
         _fail(problem)
-    try:
-        drawn = _save_picture(reports, arguments.out)
-    except OSError as error:
-        return _fail(str(error))
+    drawn = _save_picture(reports, out)
     return 2 if problems or not drawn else 0
 
 
@@ -172,7 +176,6 @@ def _camera(model: mujoco.MjModel, data: mujoco.MjData, robot: Robot) -> mujoco.
 def _save_picture(reports: list[KeyframeReport], out: Path | None) -> bool:
     """Draw and save; False where a picture was asked for and there is no OpenGL."""
     path = out or Path("runs", "keyframes", f"{reports[0].robot.name}.png")
-    path.parent.mkdir(parents=True, exist_ok=True)
     try:
         figure = draw(reports)
     except RenderError as error:
@@ -181,7 +184,7 @@ def _save_picture(reports: list[KeyframeReport], out: Path | None) -> bool:
             return True
         _fail(str(error))
         return False
-    figure.savefig(path)
+    save_figure(figure, path, WRITER)
     print(f"picture: {path}")
     return True
 

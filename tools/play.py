@@ -5,17 +5,19 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
-
-from rich.console import Console
 
 from kiras_rl.config import ConfigError
 from kiras_rl.deploy.policy import PolicyError
 from kiras_rl.robots.robot import RobotError
 from kiras_rl.tools import policy_files, summary
 from kiras_rl.tools.arguments import PICTURES, file_of
+from kiras_rl.tools.console import make_console
 from kiras_rl.tools.driver import Driver
+from kiras_rl.tools.ending import finish
 from kiras_rl.tools.ground import FLAT, terrain_of
+from kiras_rl.tools.outputs import check_output, save_arrays
 from kiras_rl.tools.rendering import RenderError
 from kiras_rl.tools.script import (
     Segment,
@@ -66,6 +68,7 @@ examples:
   kiras-play --script walk:4:0.3,crawl:4:0.3        skill:seconds:v_x[:v_y[:yaw_rate]], ...
 """
 
+TRACE = "kiras-play --trace"
 _COMMAND = "0.3"  # m/s, of a script that is not given
 _SCREENSHOT_SPEED = 0.3  # m/s
 
@@ -80,17 +83,13 @@ _OUTPUTS = {
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; return its exit status."""
     options = _parser().parse_args(arguments)
-    try:
-        if _is_live(options):
-            _drive(options)
-        else:
-            _play(options)
-    except KeyboardInterrupt:
-        return 0
-    except (PolicyError, RobotError, RenderError, LiveError, ConfigError, OSError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    return 0
+
+    def work() -> None:
+        _check_outputs(options)
+        with suppress(KeyboardInterrupt):  # Ctrl-C is how a drive ends
+            _drive(options) if _is_live(options) else _play(options)
+
+    return finish(work, (ConfigError, LiveError, PolicyError, RenderError, RobotError))
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -127,6 +126,13 @@ def _add_live_options(group: argparse._ArgumentGroup) -> None:
     add("--host", default=LOOPBACK, help=f"address that the page listens on ({LOOPBACK})")
     add("--port", type=int, default=DEFAULT_PORT, help=f"its port, 0: any ({DEFAULT_PORT})")
     add("--no-browser", action="store_true", help="only print the page's address")
+
+
+def _check_outputs(options: argparse.Namespace) -> None:
+    for option in _OUTPUTS:
+        path = getattr(options, option[2:])
+        if path:
+            check_output(path, f"kiras-play {option}")
 
 
 def _is_live(options: argparse.Namespace) -> bool:
@@ -167,7 +173,7 @@ def _play(options: argparse.Namespace) -> None:
     trace = record(driver, _script(options, driver))
     if options.table or not (options.trace or options.frames or options.video):
         rows = summary.summarize(trace, driver.metadata)
-        Console().print(summary.table(rows, trace.title))
+        make_console().print(summary.table(rows, trace.title))
     if options.trace:
         _save_trace(trace, driver, options.trace)
     if options.frames or options.video:
@@ -182,8 +188,7 @@ def _script(options: argparse.Namespace, driver: Driver) -> list[Segment]:
 
 def _save_trace(trace: Trace, driver: Driver, path: Path) -> None:
     if path.suffix == ".npz":
-        path.parent.mkdir(parents=True, exist_ok=True)
-        trace.save(path)
+        save_arrays(trace.arrays(), path, TRACE)
     else:
         from kiras_rl.tools.trace_figure import save_trace_figure  # matplotlib takes a second
 

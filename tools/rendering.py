@@ -61,6 +61,8 @@ def choose_backend() -> str:
     for backend in candidates:
         if _works(backend):
             return backend
+    if chosen:
+        raise RenderError(f"no offscreen OpenGL by MUJOCO_GL={chosen}: unset it, or {_ADVICE}")
     raise RenderError(f"no offscreen OpenGL ({' or '.join(candidates)}): {_ADVICE}")
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
-from pathlib import Path
 
 import numpy as np
 
@@ -67,9 +66,9 @@ class Trace:
         ground = "" if self.is_flat else f" on {self.terrain}"
         return f"{self.robot}{ground}, {self.time[-1]:.3g} s"
 
-    def save(self, path: str | Path) -> None:
-        """Write all arrays and names to one .npz file."""
-        np.savez_compressed(path, **{item.name: getattr(self, item.name) for item in fields(self)})
+    def arrays(self) -> dict[str, np.ndarray]:
+        """Return all arrays and names, as an .npz file holds them."""
+        return {item.name: getattr(self, item.name) for item in fields(self)}
 
 
 def record(driver: Driver, script: Sequence[Segment]) -> Trace:

@@ -17,6 +17,7 @@ from typing import Any
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from rich.table import Table
+from rich.text import Text
 
 from kiras_rl.checkpoint import LATEST, CheckpointError, find_checkpoint, load_checkpoint
 from kiras_rl.config import (
@@ -26,7 +27,9 @@ from kiras_rl.config import (
     config_from_dict,
     config_to_dict,
     load_config,
+    read_keys,
 )
+from kiras_rl.ownership import owning
 from kiras_rl.phases import SKILL_LEARNING, total_iterations
 from kiras_rl.process import StopRequest
 from kiras_rl.runner import KirasRunner
@@ -147,18 +150,8 @@ def _find(name: str) -> Path:
     )
 
 
-def _read_yaml(path: Path) -> dict:
-    try:
-        values = OmegaConf.to_container(OmegaConf.load(path))
-    except Exception as error:  # the YAML parser's own errors are of many kinds
-        raise ConfigError(f"{path} is not readable YAML: {' '.join(str(error).split())}") from None
-    if not isinstance(values, dict):
-        raise ConfigError(f"{path} holds no keys, but {values}")
-    return values
-
-
 def _read(path: Path) -> SweepFile:
-    values = _read_yaml(path)
+    values = read_keys(path)
     values["configs"] = _by_label(values.get("configs"), path)
     try:
         merged = OmegaConf.merge(OmegaConf.structured(SweepFile), values)
@@ -221,7 +214,7 @@ def _check_unchanged(run: Run) -> None:
     path = run.folder / CONFIG
     if not path.is_file() or run.checkpoint() is None:
         return
-    saved = config_from_dict(_read_yaml(path))
+    saved = config_from_dict(read_keys(path))
     for key, old, new in _changes(config_to_dict(saved), config_to_dict(run.config)):
         if key not in MACHINE_KEYS:
             raise ConfigError(
@@ -310,7 +303,7 @@ def train_sweep(runs: list[Run]) -> Report:
             if stop.requested:
                 break
             if len(runs) > 1:
-                console.print(f"[bold]run {number}/{len(runs)}[/] {run.name}", highlight=False)
+                console.print(Text(f"run {number}/{len(runs)}", style="bold"), run.name)
             try:
                 done += _train(run, stop)
             except MISTAKES as error:
@@ -334,7 +327,8 @@ def _train(run: Run, stop: StopRequest) -> bool:
     if run.is_finished():
         console.print(f"finished before: {run.folder}", highlight=False, soft_wrap=True)
         return True
-    return train_run(_open(run), stop)
+    with owning(run.folder):
+        return train_run(_open(run), stop)
 
 
 def _open(run: Run) -> KirasRunner:

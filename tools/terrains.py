@@ -13,7 +13,6 @@ import mujoco
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from rich.console import Console
 from rich.table import Table
 
 from kiras_rl.config import ConfigError, load_config
@@ -23,8 +22,13 @@ from kiras_rl.phases import FINETUNING, phase_config
 from kiras_rl.robots.robot import Robot, RobotError, load_robot
 from kiras_rl.schema import Config
 from kiras_rl.tools.arguments import PICTURES, file_of
+from kiras_rl.tools.console import make_console
+from kiras_rl.tools.ending import finish
+from kiras_rl.tools.outputs import check_output, save_figure
 from kiras_rl.tools.rendering import RenderError, make_renderer
 from kiras_rl.tools.terrain_budgets import measure_budgets
+
+WRITER = "kiras-terrains"
 
 TILE = (300, 200)
 """Width and height of one tile in pixels."""
@@ -48,24 +52,22 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--budgets", action="store_true", help="measure contacts on MuJoCo-Warp")
     parser.add_argument("overrides", nargs="*", metavar="key=value", help="of the configuration")
     arguments = parser.parse_intermixed_args(argv)  # options between overrides, too
-    try:
-        whole = load_config(arguments.cfg, [f"robot={arguments.robot}", *arguments.overrides])
-        config = phase_config(whole, FINETUNING)
-        robot = load_robot(config.robot)
-        library = _library(config)
-    except (ConfigError, RobotError) as error:
-        return _fail(str(error))
-    if arguments.budgets:
-        Console().print(make_table(config, robot, library))
-        return 0
+    return finish(lambda: _show(arguments), (ConfigError, RenderError, RobotError))
+
+
+def _show(arguments: argparse.Namespace) -> None:
+    if arguments.out:
+        check_output(arguments.out, WRITER)
+    whole = load_config(arguments.cfg, [f"robot={arguments.robot}", *arguments.overrides])
+    config = phase_config(whole, FINETUNING)
+    robot = load_robot(config.robot)
+    library = _library(config)
     path = arguments.out or Path("runs", "terrains", f"{robot.name}.png")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        draw(robot, library).savefig(path)
-    except (OSError, RenderError) as error:
-        return _fail(str(error))
+    if arguments.budgets:
+        make_console().print(make_table(config, robot, library))
+        return
+    save_figure(draw(robot, library), path, WRITER)
     print(f"picture: {path}")
-    return 0
 
 
 def make_table(config: Config, robot: Robot, library: TerrainLibrary) -> Table:
@@ -171,11 +173,6 @@ def _camera(lookat_height: float) -> mujoco.MjvCamera:
     camera.distance = 5.0
     camera.lookat[:] = (0.0, 0.0, lookat_height)
     return camera
-
-
-def _fail(message: str) -> int:
-    print(f"error: {message}", file=sys.stderr)
-    return 2
 
 
 if __name__ == "__main__":

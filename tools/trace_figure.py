@@ -13,8 +13,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from kiras_rl.deploy.policy import PolicyMetadata
+from kiras_rl.tools.outputs import save_figure
 from kiras_rl.tools.script import Trace
 
+WRITER = "kiras-play --trace"
 _STYLE = {"font.size": 9, "axes.spines.top": False, "axes.spines.right": False}
 _MEASURED = "#1f4e79"
 _TARGET = "#d1570a"
@@ -31,8 +33,7 @@ def save_trace_figure(trace: Trace, metadata: PolicyMetadata, path: Path) -> Non
     """
     with matplotlib.rc_context(_STYLE):
         figure = trace_figure(trace, metadata)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        figure.savefig(path, dpi=130)
+        save_figure(figure, path, WRITER, dpi=130)
 
 
 def trace_figure(trace: Trace, metadata: PolicyMetadata) -> Figure:

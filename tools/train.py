@@ -10,17 +10,17 @@ import shutil
 import sys
 from pathlib import Path
 
-import torch
-
 from kiras_rl import distributed
 from kiras_rl.checkpoint import FLAT, FOLDER, LATEST, find_checkpoint
 from kiras_rl.config import ConfigError, list_configs, load_config
+from kiras_rl.ownership import owning
 from kiras_rl.process import StopRequest
 from kiras_rl.runner import KirasRunner
 from kiras_rl.tools.arguments import at_least
+from kiras_rl.tools.ending import finish, is_out_of_memory
 from kiras_rl.tools.side_by_side import train_side_by_side
 from kiras_rl.tools.sweep import list_sweeps, load_sweep, train_sweep
-from kiras_rl.tools.training import MISTAKES, begin, console, message_of, resume, train_run
+from kiras_rl.tools.training import MISTAKES, begin, console, message_of, resume, run_of, train_run
 
 DESCRIPTION = """\
 Train one policy for all skills of a robot.
@@ -57,20 +57,27 @@ def main(argv: list[str] | None = None) -> int:
     """Run the command; return its exit code."""
     args = _parse(argv)
     logging.basicConfig(format="%(message)s")
+    return finish(lambda: _run(args))
+
+
+def _run(args: argparse.Namespace) -> int:
     try:
         with distributed.group():
             return _train(args)
-    except MISTAKES as error:
-        # The others of a machine make the same, but for what their disk or GPU refuses.
-        if distributed.local_rank() == 0 or isinstance(error, (OSError, torch.OutOfMemoryError)):
-            print(f"error: {message_of(error)}", file=sys.stderr)
-        return 2
     except distributed.RankLostError as error:
         print(
             f"error: {error}; the last checkpoint stays as it is: go on with --resume",
             file=sys.stderr,
         )
         return 1
+    except Exception as error:
+        short = isinstance(error, OSError) or is_out_of_memory(error)
+        if not short and not isinstance(error, MISTAKES):
+            raise
+        # The others of a machine make the same, but for what their disk or memory refuses.
+        if distributed.local_rank() == 0 or short:
+            print(f"error: {message_of(error)}", file=sys.stderr)
+        return 2
 
 
 def _parse(argv: list[str] | None) -> argparse.Namespace:
@@ -101,6 +108,11 @@ def _parse(argv: list[str] | None) -> argparse.Namespace:
         metavar="LABEL/seed_N",
         help="with --sweep: train this run of it and no other, as one job of a cluster, say",
     )
+    parser.add_argument(
+        "--changed-robot",
+        action="store_true",
+        help="with --resume: go on with today's robot though its files have changed since",
+    )
     parser.add_argument("--runs", type=Path, default=Path("runs"), help="where runs are written")
     parser.add_argument("overrides", nargs="*", metavar="key=value", help="keys to set")
     return parser.parse_intermixed_args(argv)
@@ -118,16 +130,23 @@ def _train(args: argparse.Namespace) -> int:
 
 
 def _train_one(args: argparse.Namespace) -> int:
+    if args.changed_robot and args.resume is None:
+        raise ConfigError("--changed-robot is about a run that goes on: give it with --resume")
     if args.resume is None:
-        runner = _new_run(args)
-    elif args.flat is None:
-        runner = resume(_find(args.resume, LATEST), args.overrides)
-    else:
+        return _train_run(_new_run(args))
+    if args.flat is not None:
         raise ConfigError("--flat begins a new run: give it with --cfg, not with --resume")
+    source = _find(args.resume, LATEST)
+    with owning(run_of(source)):
+        return _train_run(resume(source, args.overrides, args.changed_robot))
+
+
+def _train_run(runner: KirasRunner) -> int:
     with StopRequest() as stop:
         finished = train_run(runner, stop)
     if not finished:
-        _say(f"stopped and saved; go on with: {_command()} --resume {runner.run_dir}")
+        folder = shlex.quote(str(runner.run_dir))
+        _say(f"stopped and saved; go on with: {_command()} --resume {folder}")
     return 0
 
 

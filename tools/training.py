@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import copy
 import re
+import shlex
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
 
 import torch
-from rich.console import Console
+from rich.text import Text
 
 from kiras_rl import checkpoint, distributed
 from kiras_rl.checkpoint import CheckpointError
@@ -16,6 +19,7 @@ from kiras_rl.config import ConfigError, check_resume_overrides, config_from_dic
 from kiras_rl.deploy.policy import OnboardPolicy, PolicyError, PolicyMetadata
 from kiras_rl.envs import make_env, resolve_backend
 from kiras_rl.export import ExportError, export_policy
+from kiras_rl.ownership import owning
 from kiras_rl.phases import (
     FINETUNING,
     SKILL_LEARNING,
@@ -27,7 +31,9 @@ from kiras_rl.robots.robot import RobotError
 from kiras_rl.runner import KirasRunner
 from kiras_rl.schema import Config
 from kiras_rl.soundness import TrainingError
+from kiras_rl.tools.console import make_console
 from kiras_rl.tools.curves import draw_curves
+from kiras_rl.tools.ending import is_out_of_memory, one_line
 from kiras_rl.tools.evaluator import check_terrain, make_evaluators, onboard_policy
 from kiras_rl.tools.flat_policy import check_fit, read_flat, sizes
 from kiras_rl.tools.progress import Progress
@@ -50,15 +56,14 @@ MISTAKES = (
 CONFIG, POLICY = "config.yaml", "policy.onnx"
 """Files of a run; the second one is the last that is written."""
 
-console = Console()
+console = make_console()
 
 
 def message_of(error: Exception) -> str:
     """Return the one line that a user reads of a mistake."""
-    line = " ".join(str(error).split())
-    if isinstance(error, torch.OutOfMemoryError):
-        line += " Fewer worlds need less: lower num_envs"
-    return line
+    if is_out_of_memory(error):
+        return f"not enough memory ({one_line(error)}): fewer worlds need less, lower num_envs"
+    return one_line(error)
 
 
 # --- a learner -----------------------------------------------------------------------------------
@@ -86,19 +91,22 @@ def begin(config: Config, flat: Path | None = None) -> KirasRunner:
     return runner
 
 
-def resume(source: Path, overrides: list[str]) -> KirasRunner:
+def resume(source: Path, overrides: list[str], changed_robot: bool = False) -> KirasRunner:
     """Return the learner of a run that goes on from one of its checkpoints.
 
     Args:
         source: The checkpoint.
         overrides: `key=value` strings for the keys that may change.
+        changed_robot: Go on with the robot of today though its files have changed.
+
+    Own its folder meanwhile (`owning`): another process may write a newer one.
 
     Raises:
         CheckpointError: Unusable file, or one outside of a run.
         ConfigError: A key that may not change.
     """
     check_resume_overrides(overrides)
-    run_dir, (values, phase) = _run_of(source), distributed.from_main(lambda: _read_run(source))
+    run_dir, (values, phase) = run_of(source), distributed.from_main(lambda: _read_run(source))
     config = config_from_dict(values, overrides)
     if phase == FINETUNING and config.iterations != values["iterations"]:
         raise ConfigError(
@@ -108,6 +116,7 @@ def resume(source: Path, overrides: list[str]) -> KirasRunner:
     if phase == SKILL_LEARNING:
         check(config)
     runner = build(config, run_dir, phase)
+    runner.takes_changed_robot = changed_robot
     runner.load(str(source))
     return runner
 
@@ -150,7 +159,12 @@ def networks_of(config: Config, phase: str) -> dict[str, list[tuple[int, ...]]]:
     return sizes(build(trial, None, phase, num_envs=1).alg.networks())
 
 
-def _run_of(source: Path) -> Path:
+def run_of(source: Path) -> Path:
+    """Return the run folder that a checkpoint lies in.
+
+    Raises:
+        CheckpointError: It lies in none.
+    """
     if source.absolute().parent.name != checkpoint.FOLDER:
         raise CheckpointError(
             f"{source} lies in no run: give the run folder, or a file in its {checkpoint.FOLDER}/"
@@ -238,6 +252,11 @@ def train_run(runner: KirasRunner, stop: StopRequest) -> bool:
         Whether the run came to its end.
     """
     assert runner.run_dir is not None
+    with owning(runner.run_dir), _telling_what_is_left(runner.run_dir):
+        return _train_owned(runner, stop)
+
+
+def _train_owned(runner: KirasRunner, stop: StopRequest) -> bool:
     distributed.from_main(lambda: _begin_folder(runner))
     _announce(runner)
     with Progress(console) as progress:
@@ -250,9 +269,21 @@ def train_run(runner: KirasRunner, stop: StopRequest) -> bool:
     return finished
 
 
+@contextmanager
+def _telling_what_is_left(run_dir: Path) -> Iterator[None]:
+    """Note on whatever ends a training before its time from where it goes on."""
+    try:
+        yield
+    except BaseException as error:
+        latest = run_dir / checkpoint.FOLDER / checkpoint.LATEST
+        again = f"go on with: kiras-train --resume {shlex.quote(str(run_dir))}"
+        whole = f"{latest} is whole, {again}" if latest.is_file() else "there is no checkpoint yet"
+        error.add_note(whole)
+        raise
+
+
 def _begin_folder(runner: KirasRunner) -> None:
     assert runner.run_dir is not None
-    runner.run_dir.mkdir(parents=True, exist_ok=True)
     save_config(runner.config, runner.run_dir / CONFIG)
 
 
@@ -301,11 +332,12 @@ def _announce(runner: KirasRunner) -> None:
     steps = ranks * config.num_envs * config.learner.ppo.num_steps * sum(lengths)
     worlds = f"{config.num_envs} worlds" if ranks == 1 else f"{ranks} x {config.num_envs} worlds"
     console.print(
-        f"[bold]{config.robot}[/]: {_what_begins(runner)}, {', '.join(runner.env.skills)} | "
+        Text(config.robot, style="bold", end=""),
+        f": {_what_begins(runner)}, {', '.join(runner.env.skills)} | "
         f"{worlds}, {backend} physics, {runner.device} | "
         f"{' + '.join(map(str, lengths))} iterations, {steps / 1e6:.1f} M steps | "
         f"{runner.run_dir}",
-        highlight=False,
+        sep="",
         soft_wrap=True,
     )
 
@@ -336,11 +368,11 @@ def _conclude(runner: KirasRunner) -> None:
             console.print(as_rich(table))
     if evaluators.terrain:
         console.print(as_rich(terrain.result_table(evaluators.terrain(policy))))
+    folder = shlex.quote(str(run_dir))
     console.print(
         f"{runner.seconds / 60:.1f} min of training\n"
         f"checkpoint  {best}\nONNX        {onnx}\ncurves      {curves}\n"
-        f"next:       kiras-play {run_dir} --trace trace.png\n"
-        f"            tensorboard --logdir {run_dir}",
-        highlight=False,
+        f"next:       kiras-play {folder} --trace trace.png\n"
+        f"            tensorboard --logdir {folder}",
         soft_wrap=True,
     )

@@ -13,6 +13,7 @@ from mujoco.batch import Batch
 
 from kiras_rl.envs.simulation.base import OVERFLOW_WARNINGS, RANDOMISED_FIELDS
 from kiras_rl.envs.terrain_geoms import TERRAIN_FIELDS, TerrainGeoms
+from kiras_rl.robots.scene import hear_warnings
 
 _log = logging.getLogger(__name__)
 
@@ -48,8 +49,7 @@ class NativeSimulation:
         self.model = model = copy.copy(model)
         # A diverged world must stay visible: MuJoCo would silently reset it.
         model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
-        # Otherwise MuJoCo prints and writes MUJOCO_LOG.TXT into the current folder.
-        mujoco.set_mju_user_warning(_log.warning)
+        hear_warnings()
         self.num_worlds = num_worlds
         self.device = torch.device("cpu")
         self._substeps = substeps

@@ -12,6 +12,7 @@ from kiras_rl.deploy.policy import OnboardPolicy, PolicyError
 from kiras_rl.export import export_policy
 from kiras_rl.robots.robot import RobotError
 from kiras_rl.tools.driver import Driver
+from kiras_rl.tools.outputs import save_arrays
 from kiras_rl.tools.script import (
     Segment,
     default_script,
@@ -166,7 +167,7 @@ def test_a_recorded_script_has_one_row_a_step(driver, tmp_path):
     assert trace.skill.tolist() == [0] * 10 + [1] * 5
     assert trace.command[:, 0].tolist() == [0.0] * 10 + [0.3] * 5
     assert trace.qpos.shape == (15, 15)
-    trace.save(tmp_path / "trace.npz")
+    save_arrays(trace.arrays(), tmp_path / "trace.npz", "test")
     saved = np.load(tmp_path / "trace.npz")
     np.testing.assert_array_equal(saved["base_height"], trace.base_height)
     assert saved["skills"].tolist() == list(trace.skills)

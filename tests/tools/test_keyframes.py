@@ -63,7 +63,7 @@ def test_a_picture_that_was_asked_for_is_an_error_without_opengl(no_opengl, caps
     assert keyframes.main(["solo8", "--out", "poses.png"]) == 2
     captured = capsys.readouterr()
     assert "stilt" in captured.out
-    assert captured.err.startswith("error: no offscreen OpenGL (off): install libegl1")
+    assert captured.err.startswith("error: no offscreen OpenGL by MUJOCO_GL=off: unset it")
     assert captured.err.count("\n") == 1
 
 

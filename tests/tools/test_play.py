@@ -12,6 +12,7 @@ import urllib.request
 import matplotlib.image
 import numpy as np
 import pytest
+from patience import PATIENCE
 
 from kiras_rl.robots.robot import load_robot
 from kiras_rl.tools import policy_files, rendering
@@ -29,9 +30,9 @@ def test_the_page_is_served_until_ctrl_c(still_file):
             assert "driving still.onnx: http://127.0.0.1:" in line
             assert "this machine only" in line
             url = re.search(r"http://\S+/", line)[0]
-            assert b"<canvas" in urllib.request.urlopen(url, timeout=10).read()
+            assert b"<canvas" in urllib.request.urlopen(url, timeout=PATIENCE).read()
             process.send_signal(signal.SIGINT)
-            out, err = process.communicate(timeout=20)
+            out, err = process.communicate(timeout=PATIENCE)
         finally:
             process.kill()
     assert (process.returncode, out.strip(), err) == (0, "", "")

@@ -12,6 +12,7 @@ import matplotlib.image
 import onnx
 import pytest
 import torch
+from patience import PATIENCE
 
 from kiras_rl.checkpoint import find_checkpoint, load_checkpoint, load_policy, save_checkpoint
 from kiras_rl.config import load_config
@@ -160,12 +161,15 @@ def refusal(capsys, *argv):
         (["--cfg", "smoke", "learner.imitation.premium.rule=x"], "allowed are topk, record"),
         (["--cfg", "smoke", "evaluation.duration=1"], "more than the first 1.0 s"),
         (["--cfg", "smoke", "env.observations.proprio.foot_height={}"], "unknown observation term"),
-        (["--cfg", "smoke", "env.action_clip=0"], "action_clip must be positive"),
+        (["--cfg", "smoke", "env.action_clip=0"], "env.action_clip=0.0: must be positive"),
         (["--cfg", "smoke", "evaluation.terrain.level=2"], "terrain.level=2: allowed are 0 to 1"),
         (["--cfg", "smoke", "finetuning.env.terrain.types.hills={}"], "no term 'hills'"),
         (["--cfg", "smoke", "finetuning.learner.ppo.gama=1"], "did you mean 'learner.ppo.gamma'?"),
         (["--cfg", "smoke", "finetuning.env.rewards.terms.tork={weight: 1}"], "no term 'tork'"),
-        (["--cfg", "smoke", "finetuning.env.action_clip=0"], "finetuning: policy metadata: action"),
+        (
+            ["--cfg", "smoke", "finetuning.env.action_clip=0"],
+            "finetuning: env.action_clip=0",
+        ),
         (["--cfg", "smoke", "finetuning.sim.backend=x"], "allowed are auto, native, warp"),
         (["--cfg", "smoke", "finetuning.learner.ppo.actor_dims=[8]"], "other sizes of the actor"),
         (["--cfg", "smoke", "finetuning.learner.estimator=null"], "than in skill learning"),
@@ -227,7 +231,7 @@ def test_a_terminated_training_saves_and_goes_on(tmp_path, capsys):
             if "/100000 |" in line:  # the first iteration is done
                 break
         process.send_signal(signal.SIGTERM)
-        out, err = process.communicate(timeout=120)
+        out, err = process.communicate(timeout=PATIENCE)
     finally:
         process.kill()
     assert (process.returncode, err) == (0, "")

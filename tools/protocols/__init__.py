@@ -5,7 +5,7 @@ A protocol is a module with
 - TITLE and TEXT: a heading, and what is measured and how,
 - measure(subject) -> plain values, measured piece by piece with `subject.results`, which keeps
   them and shows the progress,
-- is_known(subject), if it reads the log of a run: whether there is one that holds it,
+- is_known(subject), if not every policy has what it asks: whether this one has,
 - section(results): tables and figures of the values of one or several policies, by their label.
 """
 

@@ -7,6 +7,7 @@ from dataclasses import asdict
 
 import torch
 
+from kiras_rl.config import ConfigError
 from kiras_rl.envs.quadruped import QuadrupedEnv
 from kiras_rl.evaluation.transitions import AFTER, BEFORE, evaluate_transitions, trace_skills
 from kiras_rl.schema import Config
@@ -51,8 +52,22 @@ _FIELDS = (
 )
 
 
+def is_known(subject: Subject) -> bool:
+    """Tell whether there are pairs of skills."""
+    return len(subject.skills) > 1
+
+
 def measure(subject: Subject) -> dict:
-    """Return the pairs on both grounds and a trace through all skills on flat ground."""
+    """Return the pairs on both grounds and a trace through all skills on flat ground.
+
+    Raises:
+        ConfigError: A policy of one skill.
+    """
+    if not is_known(subject):
+        raise ConfigError(
+            f"transitions are between two skills, and {subject.label} has {subject.skills[0]} "
+            "alone: name other protocols with --protocol"
+        )
     options = subject.options
     trials = options.trials_or(TRIALS)
     keep = {"trials": trials, "command": options.command}

@@ -11,6 +11,7 @@ from pathlib import Path
 from jinja2 import Environment, StrictUndefined
 from markupsafe import Markup
 
+from kiras_rl.tools.outputs import check_output
 from kiras_rl.tools.report.content import Figure, Section, Table
 
 PAGE = "report.html"
@@ -28,7 +29,11 @@ def write_report(folder: Path, title: str, about: Table, sections: list[Section]
 
     Returns:
         The page.
+
+    Raises:
+        OutputError: There is another page.
     """
+    check_page(folder)
     tables = folder / "tables"
     tables.mkdir(parents=True, exist_ok=True)
     for section in sections:
@@ -39,6 +44,15 @@ def write_report(folder: Path, title: str, about: Table, sections: list[Section]
     page = folder / PAGE
     page.write_text(as_html(title, about, sections), encoding="utf-8")
     return page
+
+
+def check_page(folder: Path) -> None:
+    """Refuse a folder with another page; call it before the work.
+
+    Raises:
+        OutputError: There is one.
+    """
+    check_output(folder / PAGE, "<title>KiRAS: ")
 
 
 def as_html(title: str, about: Table, sections: list[Section]) -> str:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import textwrap
 
 from rich import box
-from rich.markup import escape
 from rich.table import Table as RichTable
+from rich.text import Text
 
 from kiras_rl.tools.report.content import Table
 
@@ -26,7 +26,7 @@ def as_rich(table: Table) -> RichTable:
     )
     for i, column in enumerate(table.columns):
         lines = textwrap.wrap(column.name, HEADING_WIDTH, break_long_words=False)
-        heading = escape("\n".join([*lines, column.unit]).rstrip())
+        heading = Text("\n".join([*lines, column.unit]).rstrip())
         side = "left" if table.is_words(i) else "right"
         # Narrow terminals cut words otherwise: pitch_up and pitch_down would look the same
         shown.add_column(heading, justify=side, overflow="fold", no_wrap=i == 0)
@@ -34,9 +34,7 @@ def as_rich(table: Table) -> RichTable:
     for line, row in enumerate(table.rows):
         shown.add_row(
             *(
-                f"[green]{escape(column.text(cell))}[/]"
-                if line in best[i]
-                else escape(column.text(cell))
+                Text(column.text(cell), style="green" if line in best[i] else "")
                 for i, (column, cell) in enumerate(zip(table.columns, row, strict=True))
             )
         )

@@ -14,7 +14,7 @@ NAMES = "left stick drives, right stick turns, A push, X reset, LB RB skills, St
 
 # struct js_event of linux/joystick.h: time in ms, value, type, number
 _EVENT = struct.Struct("<IhBB")
-_BUTTON, _AXIS, _INITIAL = 0x01, 0x02, 0x80
+_BUTTON, _AXIS = 0x01, 0x02  # with 0x80 more in what the kernel tells of a pad when it opens
 _FULL = 32767
 _DEAD = 0.12  # of the full deflection: where sticks come to rest
 # numbers of the kernel's xpad driver, which most pads speak
@@ -69,7 +69,7 @@ class Gamepad:
             return
 
     def _take(self, value: int, kind: int, number: int) -> None:
-        if kind & ~_INITIAL == _AXIS:
+        if kind == _AXIS:  # what an axis says before it moves may be a rest at one of its ends
             share = value / _FULL
             self._axes[number] = share if abs(share) > _DEAD else 0.0
         elif kind == _BUTTON and value:

@@ -13,7 +13,9 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from PIL import Image
+from PIL.PngImagePlugin import PngInfo
 
+from kiras_rl.tools.outputs import check_output
 from kiras_rl.tools.viewer import LOOPBACK
 from kiras_rl.tools.viewer.browser import open_browser
 from kiras_rl.tools.viewer.choices import newest_checkpoint
@@ -25,6 +27,7 @@ from kiras_rl.tools.viewer.stage import Stage
 from kiras_rl.tools.viewer.terminal import Terminal, open_screen
 from kiras_rl.tools.viewer.view import View
 
+SCREENSHOT = "kiras-play --screenshot"
 _WINDOW = {"width": 1280, "height": 800}
 _SLOW = 3.0  # pictures a second that a browser without a GPU can draw
 _QUALITY = 88  # of a JPEG: small, and the letters stay clear
@@ -117,6 +120,7 @@ def save_screenshot(cockpit: Cockpit, path: Path, speed: float) -> None:
     Raises:
         BrowserError: If there is no Chromium, or the package that steers it is missing.
     """
+    check_output(path, SCREENSHOT)
     with open_browser() as browser, open_page(cockpit, rate=_SLOW) as (page, session):
         loop = threading.Thread(target=session.run, daemon=True)
         loop.start()
@@ -133,9 +137,11 @@ def save_screenshot(cockpit: Cockpit, path: Path, speed: float) -> None:
         picture = tab.screenshot(timeout=60_000)
         session.close()
         loop.join()
-    path.parent.mkdir(parents=True, exist_ok=True)
+    about = PngInfo()
+    about.add_text("Software", SCREENSHOT)
+    marks = {"pnginfo": about} if path.suffix == ".png" else {"comment": SCREENSHOT.encode()}
     with Image.open(io.BytesIO(picture)) as image:
-        image.convert("RGB").save(path, quality=_QUALITY, optimize=True)
+        image.convert("RGB").save(path, quality=_QUALITY, optimize=True, **marks)
 
 
 def wait_for_checkpoint(run: Path) -> Path:

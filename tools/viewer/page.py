@@ -14,7 +14,7 @@ import mujoco
 import numpy as np
 from mujoco.studio import endpoints, launch_thread, messages, viewer_protocol, web_viewer
 
-from kiras_rl.tools.viewer import LOOPBACK, LiveError
+from kiras_rl.tools.viewer import LOOPBACK, LiveError, guard
 from kiras_rl.tools.viewer.panel import Panel
 from kiras_rl.tools.viewer.stage import Stage
 
@@ -109,6 +109,7 @@ class _Viewer(web_viewer.WebViewer):
         endpoint: endpoints.ViewerEndpoint,
         panel: Panel,
     ) -> None:
+        guard.install()
         self._chosen_host, self._period, self._last = host, 1 / rate, 0.0
         config = viewer_protocol.ViewerConfig(title="KiRAS", gfx="web", http_port=port)
         super().__init__(config, endpoint, plugins=[panel])

@@ -91,6 +91,19 @@ def test_a_pad_at_rest_leaves_the_keys_alone(cockpit, pad):
     assert cockpit.target[FORWARD] == 0.3
 
 
+def test_an_axis_counts_once_it_has_moved(cockpit, device, pad):
+    for axis in range(6):
+        device.send(AXIS | 0x80, axis, -32767)  # what the kernel tells when the device is opened
+    pad.poll()
+    cockpit.advance()
+    assert not cockpit.target.any()
+    device.send(AXIS, 1, -32767)
+    pad.poll()
+    cockpit.advance()
+    assert cockpit.target[FORWARD] == pytest.approx(0.6)
+    assert cockpit.target[YAW] == 0
+
+
 def test_buttons_change_skills_and_pause(cockpit, device, pad):
     device.send(BUTTON, 5, 1)  # RB, down and up
     device.send(BUTTON, 5, 0)

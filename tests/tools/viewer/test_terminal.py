@@ -11,6 +11,7 @@ import sys
 import time
 
 import pytest
+from patience import PATIENCE
 
 from kiras_rl.deploy.policy import OnboardPolicy
 from kiras_rl.tools.ground import Tile
@@ -36,8 +37,8 @@ def play(still_file):
     os.close(master)
 
 
-def read_until(master, pattern, seconds=30.0):
-    seen, end = "", time.monotonic() + seconds
+def read_until(master, pattern):
+    seen, end = "", time.monotonic() + PATIENCE
     while not re.search(pattern, seen) and time.monotonic() < end:
         if select.select([master], [], [], 0.1)[0]:
             seen += os.read(master, 65536).decode(errors="replace")
@@ -50,7 +51,7 @@ def test_keys_drive_and_x_leaves(play):
     os.write(master, b"3")
     read_until(master, r"\x1b\[3[;d]")  # curses sends what changes: here the line of the skills
     os.write(master, b"x")
-    assert process.wait(timeout=10) == 0
+    assert process.wait(timeout=PATIENCE) == 0
     assert process.stderr.read() == ""
 
 
@@ -58,7 +59,7 @@ def test_ctrl_c_ends_it_cleanly(play):
     master, process = play
     read_until(master, r"\[1 walk\]")
     process.send_signal(2)
-    assert process.wait(timeout=10) == 0
+    assert process.wait(timeout=PATIENCE) == 0
     assert process.stderr.read() == ""
 
 

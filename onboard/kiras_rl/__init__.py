@@ -1,0 +1,1 @@
+"""KiRAS-RL on a robot: kiras_rl.deploy alone."""

@@ -1,0 +1,34 @@
+"""Text of users in the terminal, and commands that need no graphics."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+
+import pytest
+from patience import PATIENCE
+
+from kiras_rl.tools.console import make_console
+from kiras_rl.tools.report.content import Column, Table
+from kiras_rl.tools.report.terminal import as_rich
+
+
+@pytest.mark.parametrize("text", ["M [v2]/[red]x", "[/]", "a:smile:b", "\\[bold]"])
+def test_text_is_printed_as_it_is(text, capsys):
+    make_console().print(text, soft_wrap=True)
+    assert capsys.readouterr().out == f"{text}\n"
+
+
+def test_names_in_tables_are_printed_as_they_are(capsys):
+    table = Table("[red]", (Column("[/x]"), Column("m", best="high")), [("[bold]a", 1.0)])
+    make_console().print(as_rich(table))
+    out = capsys.readouterr().out
+    assert "[red]" in out and "[/x]" in out and "[bold]a" in out
+
+
+@pytest.mark.parametrize("name", ["nonsense", "osmesa"])
+def test_robots_are_loaded_whatever_graphics_there_are(name):
+    code = "from kiras_rl.robots.robot import load_robot; import mujoco; load_robot('solo8')"
+    environment = os.environ | {"MUJOCO_GL": name}
+    subprocess.run([sys.executable, "-c", code], env=environment, check=True, timeout=PATIENCE)
