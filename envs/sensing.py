@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch.nn.functional import normalize
 
+from kiras_rl.config import ConfigError
 from kiras_rl.envs import rotations
 from kiras_rl.envs.model import SensorLayout
 from kiras_rl.envs.randomness import UniformBuffer
@@ -53,7 +54,17 @@ class Sensors:
         layout: SensorLayout,
         random: UniformBuffer,
     ) -> None:
-        """Begin with sensors that make no error."""
+        """Begin with sensors that make no error.
+
+        Raises:
+            ConfigError: Observations that are later than a control step.
+        """
+        steps = sim.sensor_record.shape[1]
+        if config.observation_delay and config.observation_delay[1] > steps:
+            raise ConfigError(
+                f"env.randomization.observation_delay={list(config.observation_delay)}: at most a "
+                f"control step, which is {steps} physics steps (sim.substeps)"
+            )
         self._config, self._sim, self._layout, self._random = config, sim, layout, random
         joints, none = sim.model.nu, (0.0, 0.0)
         delay = config.observation_delay

@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
+from kiras_rl.config import ConfigError
 from kiras_rl.envs import rotations
 from kiras_rl.interfaces import CRITIC, PROPRIO
 
@@ -96,6 +97,11 @@ def test_observations_are_late_by_physics_steps(build, delay):
     if delay == 1:  # a physics step changes an angle by the velocity at its end
         then = true["joint_pos"] - 0.005 * true["joint_vel"]
         torch.testing.assert_close(read["joint_pos"], then, atol=1e-4, rtol=1e-4)
+
+
+def test_observations_are_at_most_a_control_step_late(build):
+    with pytest.raises(ConfigError, match=r"observation_delay=\[0, 5\]: at most a control step"):
+        build(observation_delay="[0,5]")
 
 
 def test_a_robot_that_has_just_begun_reads_no_past(build):
