@@ -146,7 +146,9 @@ class PolicyMetadata:
         )
         missing = [name for name in _READERS if name not in data and name not in _LATER]
         _require(not missing, f"missing: {', '.join(missing)}")
-        known = {n: read for n, read in _READERS.items() if n not in _LATER or data.get(n)}
+        known = {
+            n: read for n, read in _READERS.items() if n not in _LATER or data.get(n) is not None
+        }
         return cls(**{name: _read(name, reader, data[name]) for name, reader in known.items()})
 
     @classmethod
