@@ -25,6 +25,8 @@ def describe_deployment(
         "robot": robot.name,
         "joint_names": list(robot.joint_names),
         **{name: getattr(robot, name).tolist() for name in arrays},
+        "joint_limits": robot.joint_limits.tolist(),
+        "velocity_limit": robot.velocity_limit.tolist(),
         "action_clip": config.action_clip,
         "observation": [{"name": n, "size": k, "scale": x} for n, k, x in terms],
         "history_length": config.observations.history_length,

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import torch
 
-from kiras_rl.envs.state import CONTACT_FORCE, RobotState
+from kiras_rl.envs.state import CONTACT_FORCE, Limits, RobotState
 from kiras_rl.interfaces import Measurements
 
 
-def measure(robot: RobotState, distance: torch.Tensor, fallen: torch.Tensor) -> Measurements:
+def measure(
+    robot: RobotState, limits: Limits, distance: torch.Tensor, fallen: torch.Tensor
+) -> Measurements:
     """Collect the measurements of a step.
 
     What lies in the simulation's own buffers is copied: what a reset or a push does next is no
@@ -16,6 +18,7 @@ def measure(robot: RobotState, distance: torch.Tensor, fallen: torch.Tensor) -> 
 
     Args:
         robot: The robots after the step.
+        limits: Of their joints and motors.
         distance: From the middle of the tile, (N,), m.
         fallen: Worlds that terminate by failure, or whose physics broke or ran out of memory:
             what comes after is another life, (N,) bool.
@@ -33,7 +36,12 @@ def measure(robot: RobotState, distance: torch.Tensor, fallen: torch.Tensor) -> 
         joint_pos=robot.joint_pos.clone(),
         joint_vel=robot.joint_vel.clone(),
         joint_torque=robot.joint_torque.clone(),
+        peak_torque=robot.peak_torque,
+        beyond=(limits.beyond(robot.joint_pos) > 0.0).any(dim=1),
+        saturated=robot.saturation(limits.torque),
         foot_contact=robot.foot_contact,
+        foot_stands=robot.foot_stands,
+        foot_height=robot.foot_height,
         limb_contact=(robot.limb_force > CONTACT_FORCE).any(dim=1),
         distance=distance,
         fallen=fallen,

@@ -26,6 +26,9 @@ class SensorLayout:
         base_force_w: The same for the geoms of the base, B * 3, N.
         limb_force_w: The same for the penalised geoms, L * 3, N.
         joint_torque: Torques that actuators give to joints, J, N m.
+        motion: Orientation of the base (w, x, y, z), its angular velocity in the base frame,
+            rad/s, joint angles, rad, and joint velocities, rad/s, 7 + 2 J; None where no
+            observation is late.
     """
 
     foot_vel_w: slice
@@ -33,6 +36,7 @@ class SensorLayout:
     base_force_w: slice
     limb_force_w: slice
     joint_torque: slice
+    motion: slice | None = None
 
     @property
     def forces_w(self) -> slice:
@@ -66,6 +70,7 @@ def build_scene(
     timestep: float,
     solver_iterations: int,
     max_delay: int = 0,
+    observation_delay: int = 0,
     library: TerrainLibrary | None = None,
     visuals: bool = False,
 ) -> Scene:
@@ -76,6 +81,7 @@ def build_scene(
         timestep: Physics step, s.
         solver_iterations: Newton and line-search iterations at most.
         max_delay: Longest actuation delay in physics steps; 0 allocates no delay buffers.
+        observation_delay: Longest delay of observations in physics steps; 0 adds no sensors.
         library: Tiles that a world may show; None for flat ground, which costs nothing.
         visuals: Keep the geoms that are only looked at.
     """
@@ -90,10 +96,14 @@ def build_scene(
     if library is not None:
         add_terrain(spec, library)
     names = _add_sensors(spec, robot)
+    motion = _add_motion_sensors(spec, robot) if observation_delay else []
     model = spec.compile()
     return Scene(
         model=model,
-        sensors=SensorLayout(**{key: _span(model, value) for key, value in names.items()}),
+        sensors=SensorLayout(
+            **{key: _span(model, value) for key, value in names.items()},
+            motion=_span(model, motion) if motion else None,
+        ),
         base_body=model.body(robot.base_body).id,
         robot_geoms=[i for i in range(model.ngeom) if model.geom_priority[i] > 0],
         terrain=None if library is None else terrain_geoms(model, library),
@@ -123,6 +133,26 @@ def _add_sensors(spec: mujoco.MjSpec, robot: Robot) -> dict[str, list[str]]:
             "torque", _SENSOR.mjSENS_JOINTACTFRC, _OBJ.mjOBJ_JOINT, robot.joint_names
         ),
     }
+
+
+def _add_motion_sensors(spec: mujoco.MjSpec, robot: Robot) -> list[str]:
+    """Add sensors of what the robot's own sensors read; return their names in order.
+
+    They sit in the base frame, not at an IMU's site: errors of the IMU belong to each world.
+    """
+
+    def add(kind: mujoco.mjtSensor, objtype: mujoco.mjtObj, name: str) -> str:
+        sensor = spec.add_sensor(name=f"{kind.name}/{name}", type=kind)
+        sensor.objtype, sensor.objname = objtype, name
+        return sensor.name
+
+    base = spec.body(robot.base_body).add_site(name="motion/base").name
+    return [
+        add(_SENSOR.mjSENS_FRAMEQUAT, _OBJ.mjOBJ_SITE, base),
+        add(_SENSOR.mjSENS_GYRO, _OBJ.mjOBJ_SITE, base),
+        *(add(_SENSOR.mjSENS_JOINTPOS, _OBJ.mjOBJ_JOINT, joint) for joint in robot.joint_names),
+        *(add(_SENSOR.mjSENS_JOINTVEL, _OBJ.mjOBJ_JOINT, joint) for joint in robot.joint_names),
+    ]
 
 
 def _span(model: mujoco.MjModel, names: list[str]) -> slice:

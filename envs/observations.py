@@ -12,6 +12,7 @@ import torch
 
 from kiras_rl.config import ConfigError
 from kiras_rl.envs.lookup import evaluate, find_function
+from kiras_rl.envs.sensing import Sensed
 from kiras_rl.envs.state import Keyframes, RobotState, Task
 
 SCAN_LIMIT = 1.0  # m
@@ -39,6 +40,7 @@ class View:
 
     Attributes:
         robot: The robots now.
+        sensed: What the robots themselves read of that; `robot` for a view without errors.
         task: Their tasks.
         keyframes: The skills.
         default_joint_pos: q0, (J,), rad.
@@ -46,6 +48,7 @@ class View:
     """
 
     robot: RobotState
+    sensed: RobotState | Sensed
     task: Task
     keyframes: Keyframes
     default_joint_pos: torch.Tensor
@@ -54,17 +57,17 @@ class View:
 
 def projected_gravity(view: View) -> torch.Tensor:
     """Return the unit vector of gravity in the base frame, 3."""
-    return view.robot.gravity_b
+    return view.sensed.gravity_b
 
 
 def pitch(view: View) -> torch.Tensor:
     """Return the pitch, nose down positive, 1, rad."""
-    return view.robot.roll_pitch[:, 1:]
+    return view.sensed.roll_pitch[:, 1:]
 
 
 def roll_pitch(view: View) -> torch.Tensor:
     """Return roll and pitch, 2, rad."""
-    return view.robot.roll_pitch
+    return view.sensed.roll_pitch
 
 
 def base_lin_vel(view: View) -> torch.Tensor:
@@ -74,7 +77,7 @@ def base_lin_vel(view: View) -> torch.Tensor:
 
 def base_ang_vel(view: View) -> torch.Tensor:
     """Return the angular velocity in the base frame, 3, rad/s."""
-    return view.robot.base_ang_vel_b
+    return view.sensed.base_ang_vel_b
 
 
 def command_lin_vel_x(view: View) -> torch.Tensor:
@@ -99,12 +102,12 @@ def skill(view: View) -> torch.Tensor:
 
 def joint_pos(view: View) -> torch.Tensor:
     """Return joint angles relative to q0, J, rad."""
-    return view.robot.joint_pos - view.default_joint_pos
+    return view.sensed.joint_pos - view.default_joint_pos
 
 
 def joint_vel(view: View) -> torch.Tensor:
     """Return joint velocities, J, rad/s."""
-    return view.robot.joint_vel
+    return view.sensed.joint_vel
 
 
 def last_action(view: View) -> torch.Tensor:

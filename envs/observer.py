@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 from tensordict import TensorDict
 
 from kiras_rl import interfaces as names
 from kiras_rl.envs.observations import ObservationGroup, View
 from kiras_rl.envs.randomness import UniformBuffer, scale_to
+from kiras_rl.envs.sensing import Sensors
 from kiras_rl.schema import ObservationConfig
 
 NOISE = "noise"  # column of the random numbers
@@ -22,7 +25,7 @@ class Observer:
         proprio: What the robot knows.
         critic: What the critic sees besides the noise-free proprio part.
         imitation: Phi.
-        clean: Noise-free proprio part of the last observation, (N, P).
+        clean: Proprio part of the last observation without errors of sensors, (N, P).
         features: Phi of the last observation, (N, D).
         observation: The last observation.
     """
@@ -38,10 +41,22 @@ class Observer:
         self._history = self._frame[:, None].repeat(1, config.history_length, 1)  # (N, H, P)
         self.observation = TensorDict()
 
-    def observe(self, view: View, begun: torch.Tensor, random: UniformBuffer) -> TensorDict:
-        """Return the observation; worlds that have just `begun` (N,) get copies as history."""
+    def observe(
+        self, view: View, sensors: Sensors, begun: torch.Tensor, random: UniformBuffer
+    ) -> TensorDict:
+        """Return the observation; worlds that have just `begun` (N,) get copies as history.
+
+        Args:
+            view: Of the robots as they are.
+            sensors: Through which the robots see it.
+            begun: See above.
+            random: For the noise.
+        """
         self.clean, self.features = self.proprio(view), self.imitation(view)
-        frame = self._with_noise(self.clean, random)
+        read = self.clean
+        if not sensors.are_exact:
+            read = self.proprio(replace(view, sensed=sensors.read(view.robot, begun)))
+        frame = self._with_noise(read, random)
         shifted = torch.cat([self._history[:, 1:], self._frame[:, None]], dim=1)
         self._history = torch.where(begun[:, None, None], frame[:, None], shifted)
         self._frame = frame
@@ -90,10 +105,10 @@ class Observer:
         )
         return self.observation
 
-    def _with_noise(self, clean: torch.Tensor, random: UniformBuffer) -> torch.Tensor:
+    def _with_noise(self, read: torch.Tensor, random: UniformBuffer) -> torch.Tensor:
         if not self._config.noise:
-            return clean
-        return clean + self.proprio.noise * scale_to(random[NOISE], -1.0, 1.0)
+            return read
+        return read + self.proprio.noise * scale_to(random[NOISE], -1.0, 1.0)
 
     def state_dict(self) -> dict:
         """Return all that the next observation depends on."""

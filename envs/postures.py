@@ -11,7 +11,7 @@ from kiras_rl.envs.ground import Ground
 from kiras_rl.envs.kinematics import FootKinematics
 from kiras_rl.envs.observations import View
 from kiras_rl.envs.randomness import UniformBuffer, scale_to
-from kiras_rl.envs.state import Keyframes, RobotState, Task
+from kiras_rl.envs.state import Keyframes, Limits, RobotState, Task
 from kiras_rl.robots.robot import Robot
 from kiras_rl.schema import SkillConfig
 
@@ -37,14 +37,19 @@ class Postures:
 
         self.default_joint_pos = tensor(robot.default_joint_pos)
         self._action_scale = tensor(robot.action_scale)
+        self._limits = Limits.of(robot, device)
         self._keyframes, self._kinematics, self._ground = keyframes, kinematics, ground
         self._config = config
         parts = (robot.foot_geoms, robot.base_geoms, robot.penalised_geoms)
         self._geoms = tuple(len(part) for part in parts)
 
-    def joint_targets(self, action: torch.Tensor) -> torch.Tensor:
+    def asked(self, action: torch.Tensor) -> torch.Tensor:
         """Return what actions (N, J) ask of the joints, (N, J), rad."""
         return self.default_joint_pos + self._action_scale * action
+
+    def joint_targets(self, action: torch.Tensor) -> torch.Tensor:
+        """Return the targets that actions (N, J) give the motors: inside limits, (N, J), rad."""
+        return self.asked(action).clamp(self._limits.low, self._limits.high)
 
     def holding(self, joint_pos: torch.Tensor) -> torch.Tensor:
         """Return the actions that ask for joint angles (N, J), (N, J)."""
@@ -92,4 +97,4 @@ class Postures:
         robot = RobotState.at_rest(self._keyframes, skill, self._geoms)
         task = Task.of(command, skill, skill)
         action = self.holding(robot.joint_pos)
-        return View(robot, task, self._keyframes, self.default_joint_pos, action)
+        return View(robot, robot, task, self._keyframes, self.default_joint_pos, action)

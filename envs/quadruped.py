@@ -18,6 +18,7 @@ from kiras_rl.envs.description import describe_deployment
 from kiras_rl.envs.ground import Ground
 from kiras_rl.envs.kinematics import FootKinematics
 from kiras_rl.envs.measuring import measure
+from kiras_rl.envs.memory import Memory
 from kiras_rl.envs.model import build_scene
 from kiras_rl.envs.observations import View
 from kiras_rl.envs.observer import NOISE, Observer
@@ -25,8 +26,9 @@ from kiras_rl.envs.postures import Postures
 from kiras_rl.envs.randomization import Randomizer
 from kiras_rl.envs.randomness import UniformBuffer
 from kiras_rl.envs.rewards import RewardSum
+from kiras_rl.envs.sensing import Sensors
 from kiras_rl.envs.simulation.build import make_simulation
-from kiras_rl.envs.state import Keyframes, RobotState, Step, Task
+from kiras_rl.envs.state import STANDING, Keyframes, Limits, RobotState, Step, Task
 from kiras_rl.envs.terrain_library import build_library
 from kiras_rl.envs.terrains import CROSSED
 from kiras_rl.interfaces import Measurements, SkillEnv
@@ -61,18 +63,23 @@ class QuadrupedEnv(SkillEnv):
         self.step_dt = sim_cfg.timestep * sim_cfg.substeps
         self.max_episode_length = round(cfg.terminations.episode_length / self.step_dt)
         self._library = build_library(cfg.terrain) if cfg.terrain else None
-        delay = cfg.randomization.action_delay
+        delay, late = cfg.randomization.action_delay, cfg.randomization.observation_delay
         self.scene = build_scene(
             robot,
             sim_cfg.timestep,
             sim_cfg.solver_iterations,
             max_delay=delay[1] if delay else 0,
+            observation_delay=late[1] if late else 0,
             library=self._library,
         )
         self.sim = make_simulation(self.scene, sim_cfg, num_envs, backend, device)
         self.keyframes = Keyframes.of(robot, device)
         self.keyframe_height, self.keyframe_pitch = self.keyframes.height, self.keyframes.pitch
         self.keyframe_joint_pos = self.keyframes.joint_pos
+        self.keyframe_clearance = self.keyframes.clearance
+        self._limits = limits = Limits.of(robot, device)
+        self.joint_limits = torch.stack([limits.low, limits.high])
+        self.velocity_limit, self.torque_limit = limits.velocity, limits.torque
         self.mass = float(self.scene.model.body_subtreemass[self.scene.base_body])
         self._ground = None
         if self._library:
@@ -95,7 +102,6 @@ class QuadrupedEnv(SkillEnv):
         self._last_action = self._action.clone()
         self._last_joint_vel = torch.zeros(n, self.num_actions, device=device)
         self._last_joint_torque = torch.zeros(n, self.num_actions, device=device)
-        self._air_time = torch.zeros(n, len(robot.foot_geoms), device=device)
         self._measurements: Measurements | None = None
         self._kinematics = FootKinematics(self.scene.model, robot, device)
         self.robot = RobotState(self.sim, self.scene.sensors, self._kinematics, self._ground)
@@ -111,10 +117,13 @@ class QuadrupedEnv(SkillEnv):
         self.feature_noise = phi.noise
         self.imitation_terms = tuple(zip(phi.names, phi.sizes, phi.scales, strict=True))
         self._rewards = RewardSum(cfg.rewards, self.step_dt, self.device)
+        feet = len(self.robot_cfg.foot_geoms)
+        self._memory = Memory(self._rewards.functions, self.num_envs, feet, self.device)
         generator = torch.Generator(device=self.device)
         generator.manual_seed(seed)
         columns = {"joint": self.num_actions, "velocity": 2, NOISE: self._observer.proprio.size}
-        columns |= commands.COLUMNS | randomization.COLUMNS
+        columns |= commands.COLUMNS | randomization.columns(self.num_actions)
+        columns |= Sensors.columns(self.num_actions)
         if self._library:
             columns |= curriculum.COLUMNS | {"yaw": 1}
         self._random = UniformBuffer(self.num_envs, columns, generator)
@@ -122,6 +131,7 @@ class QuadrupedEnv(SkillEnv):
             cfg.commands, cfg.skills, len(self.skills), self._random, self.device
         )
         self._randomizer = Randomizer(cfg.randomization, self.scene, self.sim, self._random)
+        self._sensors = Sensors(cfg.randomization, self.sim, self.scene.sensors, self._random)
         self._curriculum = None
         if self._library:
             self._curriculum = Curriculum(
@@ -142,6 +152,8 @@ class QuadrupedEnv(SkillEnv):
         """Return the attributes that a step reads and replaces; see `Recorded`."""
         names = [*_BUFFERS, "_last_action", *(f"task.{name}" for name in vars(self.task))]
         slots: list[tuple[object, str]] = [(self, name) for name in names]
+        slots += [(self._memory, name) for name in self._memory.names]
+        slots += [(self._sensors, "errors")]
         slots += [(self._tasks, "probabilities")]
         slots += [(self._observer, name) for name in ("clean", "features", "_frame", "_history")]
         if self._curriculum:
@@ -182,7 +194,9 @@ class QuadrupedEnv(SkillEnv):
         clip = self.cfg.action_clip
         self._last_action, self._action = self._action, actions.clamp(-clip, clip)
         begin = time.perf_counter()
-        self.sim.step(self._postures.joint_targets(self._action))
+        # A motor follows its encoder: what the encoder calls the target is off by its bias.
+        targets = self._postures.joint_targets(self._action) - self._sensors.encoder_bias
+        self.sim.step(targets)
         physics_time = time.perf_counter() - begin
         self._random.refill()
         obs, rewards, dones, extras = self._advance()
@@ -212,7 +226,7 @@ class QuadrupedEnv(SkillEnv):
             names.NEXT_PROPRIO: _unless(invalid, observer.proprio(view), observer.clean),
             "log": self._log(terms, fallen, time_outs, diverged),
         }
-        self._measurements = measure(self.robot, distance, fallen | invalid)
+        self._measurements = measure(self.robot, self._limits, distance, fallen | invalid)
 
         done = fallen | time_outs
         if self._curriculum:
@@ -231,20 +245,25 @@ class QuadrupedEnv(SkillEnv):
 
         A world whose physics broke has no meaningful terms; it earns nothing but the termination.
         """
+        command = self.task.command
         step = Step(
+            stands=torch.linalg.vector_norm(command, dim=-1) < STANDING,
             robot=self.robot,
             task=self.task,
             keyframes=self.keyframes,
+            limits=self._limits,
+            target=self._postures.asked(self._action),
             action=self._action,
             last_action=self._last_action,
             last_joint_vel=self._last_joint_vel,
             last_joint_torque=self._last_joint_torque,
-            air_time=self._air_time,
+            memory=self._memory,
             fresh=self._length == 1,
             fallen=fallen,
             dt=self.step_dt,
         )
         terms = self._rewards(step)
+        self._memory.advance(step)
         return terms.masked_fill(invalid[:, None] & ~self._rewards.is_termination, 0.0)
 
     def _begin_next(self, done: torch.Tensor) -> None:
@@ -255,7 +274,6 @@ class QuadrupedEnv(SkillEnv):
                 self._curriculum.keep_counting((task.skill == self.task.skill) | done)
             self.task = task
         self._last_joint_torque = self.robot.joint_torque.clone()
-        self._air_time = (self._air_time + self.step_dt) * ~self.robot.foot_contact
         self._reset_worlds(done, self.task.start)
         push, velocity = self._randomizer.pushes(self.step_dt)
         qvel = self.sim.qvel.clone()
@@ -272,6 +290,7 @@ class QuadrupedEnv(SkillEnv):
     def _reset_worlds(self, mask: torch.Tensor, start: torch.Tensor) -> None:
         """Put the masked worlds into the keyframes `start`, (N,), with new physics and ground."""
         self._randomizer.reset(mask)
+        self._sensors.reset(mask)
         if self._curriculum:
             tile = self._curriculum.tiles(self.task.skill) if self._placed is None else self._placed
             self._write_terrain(mask, tile)
@@ -279,9 +298,10 @@ class QuadrupedEnv(SkillEnv):
         joint_pos = qpos[:, 7:]
         self.sim.write_state(mask, qpos, qvel, joint_pos)
         # The targets that hold the start pose: what was "commanded" before the episode.
-        self._action = torch.where(mask[:, None], self._postures.holding(joint_pos), self._action)
+        holding = self._postures.holding(joint_pos + self._sensors.encoder_bias)
+        self._action = torch.where(mask[:, None], holding, self._action)
         self._last_joint_torque = self._last_joint_torque.masked_fill(mask[:, None], 0.0)
-        self._air_time = self._air_time.masked_fill(mask[:, None], 0.0)
+        self._memory.forget(mask)
         self._length = self._length.masked_fill(mask, 0)
 
     def _write_terrain(self, mask: torch.Tensor, tile: torch.Tensor) -> None:
@@ -292,10 +312,10 @@ class QuadrupedEnv(SkillEnv):
 
     def _view(self) -> View:
         q0 = self._postures.default_joint_pos
-        return View(self.robot, self.task, self.keyframes, q0, self._action)
+        return View(self.robot, self.robot, self.task, self.keyframes, q0, self._action)
 
     def _observe(self, begun: torch.Tensor) -> TensorDict:
-        return self._observer.observe(self._view(), begun, self._random)
+        return self._observer.observe(self._view(), self._sensors, begun, self._random)
 
     def _log(
         self,
@@ -419,6 +439,8 @@ class QuadrupedEnv(SkillEnv):
             "generator": self._random.generator.get_state(),
             "observer": self._observer.state_dict(),
             "buffers": {name: getattr(self, name) for name in _BUFFERS},
+            "memory": self._memory.state_dict(),
+            "sensors": self._sensors.state_dict(),
             "curriculum": self._curriculum.state_dict() if self._curriculum else {},
             "tile": self._ground.tile if self._ground else None,
         }
@@ -433,6 +455,8 @@ class QuadrupedEnv(SkillEnv):
         self._random.generator.set_state(state["generator"].cpu())
         for name, buffer in state["buffers"].items():
             setattr(self, name, buffer.to(self.device))
+        self._memory.load_state_dict(state["memory"])
+        self._sensors.load_state_dict(state["sensors"])
         self._observer.load_state_dict(state["observer"])
         if self._curriculum:
             self._curriculum.load_state_dict(state["curriculum"])
@@ -441,7 +465,7 @@ class QuadrupedEnv(SkillEnv):
 
 
 _EVENTS = ("Episode/falls", "Episode/time_outs", "Sim/diverged", "Sim/overflowed")
-_BUFFERS = ("_length", "_action", "_last_joint_vel", "_last_joint_torque", "_air_time")
+_BUFFERS = ("_length", "_action", "_last_joint_vel", "_last_joint_torque")
 
 
 def _unless(mask: torch.Tensor, new: torch.Tensor, old: torch.Tensor) -> torch.Tensor:

@@ -15,19 +15,26 @@ from kiras_rl.envs.randomness import UniformBuffer, scale_to
 from kiras_rl.envs.simulation.base import BODY_FIELDS, Simulation
 from kiras_rl.schema import RandomizationConfig
 
-COLUMNS = {
-    "friction": 1,
-    "body": 1,
-    "kp_factor": 1,
-    "kd_factor": 1,
-    "action_delay": 1,
-    "push": 2,
-    "push_chance": 1,
-    "torque_factor": 1,
-}
-"""Random numbers that this module takes each step."""
+BODIES = 512  # robots of different masses and centres of mass among which worlds draw
+BASE_DOFS = 6  # of the free joint, before those of the legs
+KP, KD = 4, 6  # columns of a DC motor's gainprm that hold the gains of its controller
 
-BODIES = 512  # bases of different mass and centre of mass among which worlds draw
+
+def columns(num_joints: int) -> dict[str, int]:
+    """Return the random numbers that this module takes each step."""
+    return {
+        "friction": 1,
+        "body": 1,
+        "kp_factor": 1,
+        "kd_factor": 1,
+        "motor_factor": num_joints,
+        "torque_factor": 1,
+        "joint_friction_factor": num_joints,
+        "joint_damping_factor": num_joints,
+        "action_delay": 1,
+        "push": 2,
+        "push_chance": 1,
+    }
 
 
 class Randomizer:
@@ -49,26 +56,29 @@ class Randomizer:
         slides[scene.robot_geoms, 0] = True
         self._slides = slides.to(sim.device)
         self._bodies = None
-        if config.payload or config.com_shift:
-            fields = draw_bodies(scene, config.payload, config.com_shift)
+        if config.payload or config.com_shift or config.leg_mass_factor:
+            fields = draw_bodies(scene, config.payload, config.com_shift, config.leg_mass_factor)
             self._bodies = {name: values.to(sim.device) for name, values in fields.items()}
-        self._gain, self._bias = nominal("actuator_gainprm"), nominal("actuator_biasprm")
+        self._gain = nominal("actuator_gainprm")
         self._delay = nominal("actuator_delay")
         self._limits = nominal("actuator_forcerange")
+        self._joints = {name: nominal(name) for name in ("dof_frictionloss", "dof_damping")}
 
     def reset(self, mask: torch.Tensor) -> None:
         """Draw the physics of the masked worlds, (N,) bool."""
         config = self._config
         if config.friction:
-            self._write_friction(mask, self._draw("friction", config.friction))
+            self._write_friction(mask, self._draw("friction"))
         if self._bodies:
             number = scale_to(self._random["body"][:, 0], 0.0, BODIES).long()
             for name, values in self._bodies.items():
                 self._sim.write_field(name, mask, values[number])
-        if config.kp_factor or config.kd_factor:
+        if config.kp_factor or config.kd_factor or config.motor_factor:
             self._write_gains(mask)
+        self._write_joints(mask, "dof_frictionloss", "joint_friction_factor")
+        self._write_joints(mask, "dof_damping", "joint_damping_factor")
         if config.torque_factor:
-            factor = self._draw("torque_factor", config.torque_factor)
+            factor = self._draw("torque_factor")
             self._sim.write_field("actuator_forcerange", mask, self._limits * factor[:, None])
         if config.action_delay:
             self._write_delay(mask, config.action_delay)
@@ -80,8 +90,9 @@ class Randomizer:
         mask = self._random["push_chance"][:, 0] < rate
         return mask, scale_to(self._random["push"], *limits)
 
-    def _draw(self, column: str, limits: tuple[float, float] | None) -> torch.Tensor | None:
-        return None if limits is None else scale_to(self._random[column], *limits)
+    def _draw(self, name: str) -> torch.Tensor:
+        """Draw values of one of the configured ranges, (N, 1) or (N, J)."""
+        return scale_to(self._random[name], *getattr(self._config, name))
 
     def _write_friction(self, mask: torch.Tensor, friction: torch.Tensor) -> None:
         # (N, 1) on every geom of the robot; by a mask: a list of them would be copied to the GPU
@@ -89,17 +100,24 @@ class Randomizer:
         self._sim.write_field("geom_friction", mask, values)
 
     def _write_gains(self, mask: torch.Tensor) -> None:
-        """Scale a position actuator: gain kp, bias (0, -kp, -kd)."""
-        gain, bias = self._gain.clone(), self._bias.clone()
-        kp = self._draw("kp_factor", self._config.kp_factor)
-        kd = self._draw("kd_factor", self._config.kd_factor)
-        if kp is not None:
-            gain[..., 0].mul_(kp)
-            bias[..., 1].mul_(kp)
-        if kd is not None:
-            bias[..., 2].mul_(kd)
+        """Scale the gains: of all joints alike, and of each by the strength of its motor."""
+        gain, config = self._gain.clone(), self._config
+        if config.kp_factor:
+            gain[..., KP].mul_(self._draw("kp_factor"))
+        if config.kd_factor:
+            gain[..., KD].mul_(self._draw("kd_factor"))
+        if config.motor_factor:
+            strength = self._draw("motor_factor")
+            gain[..., KP].mul_(strength)
+            gain[..., KD].mul_(strength)
         self._sim.write_field("actuator_gainprm", mask, gain)
-        self._sim.write_field("actuator_biasprm", mask, bias)
+
+    def _write_joints(self, mask: torch.Tensor, field: str, name: str) -> None:
+        """Scale friction or damping, a factor of its own for each joint."""
+        if getattr(self._config, name):
+            values = self._joints[field].clone()
+            values[:, BASE_DOFS:].mul_(self._draw(name))
+            self._sim.write_field(field, mask, values)
 
     def _write_delay(self, mask: torch.Tensor, limits: tuple[int, int]) -> None:
         """Delay the targets by whole physics steps, one delay for all joints of a world."""
@@ -114,9 +132,13 @@ def draw_bodies(
     scene: Scene,
     payload: tuple[float, float] | None,
     com_shift: tuple[float, float] | None,
+    leg_mass_factor: tuple[float, float] | None = None,
     count: int = BODIES,
 ) -> dict[str, torch.Tensor]:
-    """Return BODY_FIELDS of robots whose base carries a payload and has its centre of mass moved.
+    """Return BODY_FIELDS of robots whose base and links weigh something else.
+
+    The base carries a payload and has its centre of mass moved; each link of a leg is heavier or
+    lighter by a factor, and so is its inertia.
 
     What follows from a mass is computed here, by MuJoCo, and once: at a reset a world only copies
     it. Payload and shifts fill their box evenly (Sobol), the same in every run.
@@ -125,6 +147,7 @@ def draw_bodies(
         scene: Its model is nominal.
         payload: Range of the mass that is added, kg.
         com_shift: Range of the shift along each axis of the base, m.
+        leg_mass_factor: Range of the factor of each link.
         count: How many.
 
     Returns:
@@ -141,15 +164,19 @@ def draw_bodies(
         )
     model, base = copy.copy(scene.model), scene.base_body
     data = mujoco.MjData(model)
-    uniform = SobolEngine(4, scramble=True, seed=1).draw(count, dtype=torch.float64)
+    links = [body for body in range(base + 1, model.nbody) if model.body_rootid[body] == base]
+    uniform = SobolEngine(4 + len(links), scramble=True, seed=1).draw(count, dtype=torch.float64)
     masses = scale_to(uniform[:, 0], *(payload or (0.0, 0.0))) + nominal
-    shift = scale_to(uniform[:, 1:], *(com_shift or (0.0, 0.0))).numpy()
+    shift = scale_to(uniform[:, 1:4], *(com_shift or (0.0, 0.0))).numpy()
+    factors = scale_to(uniform[:, 4:], *(leg_mass_factor or (1.0, 1.0))).numpy()
     centres = model.body_ipos[base] + shift
     fields = {
         name: np.empty((count, *getattr(model, name).shape), np.float32) for name in BODY_FIELDS
     }
     for k, mass in enumerate(masses.tolist()):
         model.body_mass[base], model.body_ipos[base] = mass, centres[k]
+        model.body_mass[links] = scene.model.body_mass[links] * factors[k]
+        model.body_inertia[links] = scene.model.body_inertia[links] * factors[k][:, None]
         mujoco.mj_setConst(model, data)
         for name, values in fields.items():
             values[k] = getattr(model, name)

@@ -2,22 +2,23 @@
 
 A term's value is positive and its weight in the YAML gives the sign; only `feet_drag` is negative,
 for the paper gives it a positive weight. The paper's table is cfg/paper.yaml.
+
+Terms of the gait judge a foot when it lands or lifts off, from what is remembered of its swing or
+stance (kiras_rl.envs.memory), and leave a robot alone that is told to stand.
 """
 
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable
 from functools import partial
 
 import torch
 
 from kiras_rl.config import ConfigError
 from kiras_rl.envs.lookup import evaluate, find_function
+from kiras_rl.envs.memory import remembering
 from kiras_rl.envs.state import Step
 from kiras_rl.schema import RewardConfig
-
-STANDING = 0.1  # m/s or rad/s; a smaller command asks to stand
 
 
 def tracking_lin_vel(step: Step, sigma: float, lateral: float = 0.0) -> torch.Tensor:
@@ -98,13 +99,81 @@ def foot_clearance(step: Step, height: float) -> torch.Tensor:
     return (missing * speed).sum(-1)
 
 
+def air_time(before: torch.Tensor, step: Step) -> torch.Tensor:
+    """Remember for how long each foot has been off the ground, (N, F), s."""
+    return (before + step.dt) * ~step.robot.foot_stands
+
+
+def stance_time(before: torch.Tensor, step: Step) -> torch.Tensor:
+    """Remember for how long each foot has stood, (N, F), s."""
+    return (before + step.dt) * step.robot.foot_stands
+
+
+def swing_peak(before: torch.Tensor, step: Step) -> torch.Tensor:
+    """Remember how high each foot has been in its swing, (N, F), m."""
+    return torch.maximum(before, step.robot.foot_height) * ~step.robot.foot_stands
+
+
+@remembering(air_time)
 def feet_air_time(step: Step, target: float) -> torch.Tensor:
     """Return by how much the feet that land now were in the air longer than `target`, summed, s.
 
-    Short steps cost, long ones earn; a robot that is asked to stand is left alone.
+    Short steps cost, long ones earn.
     """
-    landing = step.robot.foot_contact & (step.air_time > 0.0)
-    return ((step.air_time - target) * landing).sum(-1) * ~_standing(step)
+    return ((step.memory[air_time] - target) * _landing(step)).sum(-1) * ~step.stands
+
+
+@remembering(air_time)
+def short_swing(step: Step, least: float) -> torch.Tensor:
+    """Return the sum over feet that land of the share of `least` s that their swing lacks."""
+    lacking = (1.0 - step.memory[air_time] / least).clamp(min=0.0)
+    return (lacking * _landing(step)).sum(-1) * ~step.stands
+
+
+@remembering(stance_time)
+def short_stance(step: Step, least: float) -> torch.Tensor:
+    """Return the sum over feet that lift off of the share of `least` s that their stance lacks."""
+    stood = step.memory[stance_time]
+    lifting = ~step.robot.foot_stands & (stood > 0.0)
+    return ((1.0 - stood / least).clamp(min=0.0) * lifting).sum(-1) * ~step.stands
+
+
+@remembering(air_time, swing_peak)
+def low_swing(step: Step, factor: float) -> torch.Tensor:
+    """Return the sum over feet that land of the squared share of the height that they lacked.
+
+    Args:
+        step: The step.
+        factor: Of the clearance that steps of the skill should have.
+    """
+    wanted = (factor * step.keyframes.clearance[step.task.skill])[:, None]
+    lacking = (1.0 - step.memory[swing_peak] / wanted).clamp(min=0.0).square()
+    return (lacking * _landing(step)).sum(-1) * ~step.stands
+
+
+@remembering(stance_time, air_time)
+def idle_feet(step: Step, most: float) -> torch.Tensor:
+    """Return the number of feet that have neither lifted off nor landed for over `most` s."""
+    idle = (step.memory[stance_time] > most) | (step.memory[air_time] > most)
+    return idle.float().sum(-1) * ~step.stands
+
+
+def flight(step: Step, feet: float) -> torch.Tensor:
+    """Return how many feet fewer than `feet` are on the ground."""
+    standing = step.robot.foot_stands.float().sum(-1)
+    return (feet - standing).clamp(min=0.0) * ~step.stands
+
+
+def joint_limits(step: Step, margin: float) -> torch.Tensor:
+    """Return how far joints and targets are outside limits that are `margin` narrower, rad."""
+    angles = torch.cat([step.robot.joint_pos[:, None], step.target[:, None]], dim=1)
+    return step.limits.beyond(angles, margin).sum(dim=(1, 2))
+
+
+def torque_limits(step: Step, share: float) -> torch.Tensor:
+    """Return the sum of torques beyond a `share` of their limits, in limits."""
+    used = step.robot.peak_torque / step.limits.torque
+    return (used - share).clamp(min=0.0).sum(-1)
 
 
 def feet_drag(step: Step) -> torch.Tensor:
@@ -125,13 +194,18 @@ def collision(step: Step, threshold: float) -> torch.Tensor:
 
 def stand_still(step: Step) -> torch.Tensor:
     """Return the sum of absolute joint velocities when asked to stand, rad/s."""
-    return torch.where(_standing(step), step.robot.joint_vel.abs().sum(-1), 0.0)
+    return torch.where(step.stands, step.robot.joint_vel.abs().sum(-1), 0.0)
+
+
+def raised_feet(step: Step) -> torch.Tensor:
+    """Return the number of feet off the ground when asked to stand."""
+    return (~step.robot.foot_stands).float().sum(-1) * step.stands
 
 
 def stand_still_pose(step: Step) -> torch.Tensor:
     """Return the sum of |q - keyframe| when asked to stand, rad."""
     error = (step.robot.joint_pos - step.keyframes.joint_pos[step.task.skill]).abs().sum(-1)
-    return torch.where(_standing(step), error, 0.0)
+    return torch.where(step.stands, error, 0.0)
 
 
 def skill_height(step: Step, sigma: float) -> torch.Tensor:
@@ -151,15 +225,16 @@ def termination(step: Step) -> torch.Tensor:
     return step.fallen.float()
 
 
-def _standing(step: Step) -> torch.Tensor:
-    return torch.linalg.vector_norm(step.task.command, dim=-1) < STANDING
+def _landing(step: Step) -> torch.Tensor:
+    """Return the feet that stand and did not before, (N, F) bool."""
+    return step.robot.foot_stands & (step.memory[air_time] > 0.0)
 
 
 class RewardSum:
     """The weighted sum of the configured terms."""
 
     def __init__(self, config: RewardConfig, step_dt: float, device: torch.device) -> None:
-        """Look the terms up.
+        """Look the terms up; `functions` are those without their parameters.
 
         Raises:
             ConfigError: Unknown term or parameter, or a parameter that is no number.
@@ -173,6 +248,7 @@ class RewardSum:
         self.names = list(terms)
         self.is_termination = torch.tensor([n == "termination" for n in terms], device=device)
         self._terms = [_bind(name, values) for name, values in terms.items()]
+        self.functions = [term.func for term in self._terms]
         scale = step_dt if config.scale_by_dt else 1.0
         weights = [float(values["weight"]) * scale for values in terms.values()]
         self._weights = torch.tensor(weights, device=device)
@@ -191,7 +267,7 @@ class RewardSum:
         return torch.stack(values, dim=1) * self._weights
 
 
-def _bind(name: str, values: dict) -> Callable[[Step], torch.Tensor]:
+def _bind(name: str, values: dict) -> partial[torch.Tensor]:
     function = find_function(globals(), name, Step, where="env.rewards.terms")
     parameters = {key: value for key, value in values.items() if key != "weight"}
     signature = inspect.signature(function)

@@ -13,10 +13,13 @@ import torch
 from kiras_rl.envs import rotations
 from kiras_rl.envs.ground import Ground
 from kiras_rl.envs.kinematics import FootKinematics
+from kiras_rl.envs.memory import Memory
 from kiras_rl.envs.model import SensorLayout
 from kiras_rl.envs.simulation.base import Simulation
 from kiras_rl.robots.robot import Robot
 
+STANDING = 0.1  # m/s or rad/s; a smaller command asks to stand
+AT_LIMIT = 0.999  # of a torque's limit; the rest is rounding
 CONTACT_FORCE = 1.0  # N; a foot that presses harder than this stands
 PATCH_SPACING = 0.1  # m between the points whose mean is the ground under the base
 SCAN_SHAPE = (9, 7)  # points of the height scan, forward and to the left [paper: 63]
@@ -69,6 +72,7 @@ class RobotState:
         feet, base, limbs = (torch.zeros(len(skill), n, device=skill.device) for n in geoms)
         robot.foot_force, robot.base_force, robot.limb_force = feet, base, limbs
         robot.foot_contact = torch.ones_like(feet, dtype=torch.bool)
+        robot.foot_stands = robot.foot_contact
         robot.foot_vel_w = zero[:, None].expand(-1, geoms[0], -1)
         robot.base_height = keyframes.height[skill]
         robot.base_lin_vel_b = robot.base_lin_vel_h = robot.base_ang_vel_b = zero
@@ -77,6 +81,7 @@ class RobotState:
         robot.joint_pos = keyframes.joint_pos[skill]
         robot.joint_vel = torch.zeros_like(robot.joint_pos)
         robot.joint_torque = robot.joint_vel.clone()
+        robot.peak_torque = robot.joint_torque
         robot._foot_height = torch.zeros_like(feet)
         robot.base_pos_w = torch.zeros_like(zero)
         robot.base_pos_w[:, 2] = robot.base_height
@@ -152,9 +157,21 @@ class RobotState:
         self.foot_force, self.base_force, self.limb_force = peaks.split(layout.geoms, dim=1)
         feet = squared[:, -1, : layout.geoms[0]]
         self.foot_contact = feet > CONTACT_FORCE**2  # (N, F) bool
+        # In any of the physics steps: a foot that chatters has not been lifted, (N, F) bool
+        self.foot_stands = self.foot_force > CONTACT_FORCE
         last = record[:, -1]
         self.foot_vel_w = last[:, layout.foot_vel_w].unflatten(1, (-1, 3))  # (N, F, 3), m/s
         self.joint_torque = last[:, layout.joint_torque]  # (N, J), N m
+        self._torques = record[:, :, layout.joint_torque].abs()  # (N, K, J), N m
+        self.peak_torque = self._torques.amax(dim=1)  # of the physics steps, (N, J), N m
+
+    def saturation(self, limit: torch.Tensor) -> torch.Tensor:
+        """Return the share of the physics steps in which a torque is at its limit, (N,).
+
+        Args:
+            limit: (J,), N m.
+        """
+        return (self._torques >= AT_LIMIT * limit).any(dim=2).float().mean(dim=1)
 
 
 @dataclass
@@ -188,6 +205,7 @@ class Keyframes:
 
     Attributes:
         height: Base height, (S,), m.
+        clearance: Height that a foot should clear in a step, (S,), m.
         pitch: Nose down positive, (S,), rad.
         joint_pos: (S, J), rad.
         gravity_b: Projected gravity, (S, 3).
@@ -195,6 +213,7 @@ class Keyframes:
     """
 
     height: torch.Tensor
+    clearance: torch.Tensor
     pitch: torch.Tensor
     joint_pos: torch.Tensor
     gravity_b: torch.Tensor
@@ -211,11 +230,40 @@ class Keyframes:
         zero = torch.zeros_like(pitch)
         return cls(
             height=tensor([k.base_height for k in robot.keyframes]),
+            clearance=tensor(robot.clearance.tolist()),
             pitch=pitch,
             joint_pos=tensor([list(k.joint_pos) for k in robot.keyframes]),
             gravity_b=torch.stack([torch.sin(pitch), zero, -torch.cos(pitch)], dim=-1),
             code=torch.eye(len(pitch), device=device),
         )
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What joints and motors of a robot allow, as tensors, J columns.
+
+    Attributes:
+        low: Least joint angles, (J,), rad.
+        high: Largest joint angles, (J,), rad.
+        velocity: Largest joint velocities, (J,), rad/s.
+        torque: Largest torques, (J,), N m.
+    """
+
+    low: torch.Tensor
+    high: torch.Tensor
+    velocity: torch.Tensor
+    torque: torch.Tensor
+
+    @classmethod
+    def of(cls, robot: Robot, device: torch.device) -> Limits:
+        """Collect the limits of a robot."""
+        low, high = robot.joint_limits.T
+        values = (low, high, robot.velocity_limit, robot.torque_limit)
+        return cls(*(torch.tensor(x, dtype=torch.float32, device=device) for x in values))
+
+    def beyond(self, joint_pos: torch.Tensor, margin: float = 0.0) -> torch.Tensor:
+        """Return how far angles (..., J) are outside limits that are `margin` narrower, rad."""
+        return (joint_pos - joint_pos.clamp(self.low + margin, self.high - margin)).abs()
 
 
 @dataclass
@@ -224,15 +272,17 @@ class Step:
 
     Attributes:
         robot: The robots after the step.
+        stands: Worlds that are told to stand, (N,) bool.
         task: Their tasks.
         keyframes: The skills.
+        limits: Of joints and motors.
+        target: What the action asked of the joints, before it was clamped to limits, (N, J), rad.
         action: Clipped action of this step, (N, J).
         last_action: Clipped action of the step before, (N, J); in the first step of an episode the
             one that holds the start pose.
         last_joint_vel: Before the step, (N, J), rad/s.
         last_joint_torque: Before the step, (N, J), N m.
-        air_time: How long each foot had been off the ground before the step, (N, F), s; zero for
-            feet that stood, and after a reset.
+        memory: What terms remember of the steps before.
         fresh: Worlds in the first step of an episode, (N,) bool; `delta_torques` is zero there,
             for there is no torque of a step before.
         fallen: Worlds that terminate by failure, (N,) bool.
@@ -240,13 +290,16 @@ class Step:
     """
 
     robot: RobotState
+    stands: torch.Tensor
     task: Task
     keyframes: Keyframes
+    limits: Limits
+    target: torch.Tensor
     action: torch.Tensor
     last_action: torch.Tensor
     last_joint_vel: torch.Tensor
     last_joint_torque: torch.Tensor
-    air_time: torch.Tensor
+    memory: Memory
     fresh: torch.Tensor
     fallen: torch.Tensor
     dt: float

@@ -81,7 +81,12 @@ class Measurements:
         joint_pos: (N, J), rad.
         joint_vel: (N, J), rad/s.
         joint_torque: (N, J), N m, a physics step before the rest.
+        peak_torque: Largest of the physics steps, (N, J), N m.
+        beyond: Worlds with a joint beyond its limits, bool.
+        saturated: Share of the physics steps in which a motor gave all that it may.
         foot_contact: Feet on the ground, (N, F) bool.
+        foot_stands: Feet on the ground in any of the physics steps, (N, F) bool.
+        foot_height: Of their lowest points above the ground, (N, F), m.
         limb_contact: Worlds where a thigh or shank touched the ground, bool.
         distance: How far the base is from the middle of its tile, the larger of |x| and |y|, m.
         fallen: Worlds that terminate by failure at this step, bool.
@@ -99,7 +104,12 @@ class Measurements:
     joint_pos: torch.Tensor
     joint_vel: torch.Tensor
     joint_torque: torch.Tensor
+    peak_torque: torch.Tensor
+    beyond: torch.Tensor
+    saturated: torch.Tensor
     foot_contact: torch.Tensor
+    foot_stands: torch.Tensor
+    foot_height: torch.Tensor
     limb_contact: torch.Tensor
     distance: torch.Tensor
     fallen: torch.Tensor
@@ -135,6 +145,18 @@ class SkillEnv(VecEnv):
 
     keyframe_joint_pos: torch.Tensor
     """Joint angles of each keyframe, (S, J), rad."""
+
+    keyframe_clearance: torch.Tensor
+    """Height that a foot should clear in a step of each skill, (S,), m."""
+
+    joint_limits: torch.Tensor
+    """Least and largest angle of each joint, (2, J), rad; infinite for none."""
+
+    velocity_limit: torch.Tensor
+    """Largest velocity of each joint, (J,), rad/s; infinite for none."""
+
+    torque_limit: torch.Tensor
+    """Largest torque of each joint before randomization, (J,), N m."""
 
     mass: float
     """Mass of the robot before randomization, kg."""

@@ -79,15 +79,23 @@ class TerminationConfig:
 
 @dataclass
 class RandomizationConfig:
-    """Domain randomization; null leaves the nominal value."""
+    """Domain randomization: ranges [low, high]; null leaves the nominal value."""
 
     friction: tuple[float, float] | None
     payload: tuple[float, float] | None
     com_shift: tuple[float, float] | None
     kp_factor: tuple[float, float] | None
     kd_factor: tuple[float, float] | None
+    motor_factor: tuple[float, float] | None
     torque_factor: tuple[float, float] | None
+    leg_mass_factor: tuple[float, float] | None
+    joint_friction_factor: tuple[float, float] | None
+    joint_damping_factor: tuple[float, float] | None
+    encoder_bias: tuple[float, float] | None
+    imu_tilt: tuple[float, float] | None
+    gyro_bias: tuple[float, float] | None
     action_delay: tuple[int, int] | None
+    observation_delay: tuple[int, int] | None
     push_velocity: tuple[float, float] | None
     push_interval: float
 

@@ -17,6 +17,7 @@ from kiras_rl.robots.reading import (
     frozen,
     hint,
     matching,
+    number,
     per_name,
     ranges_per_name,
     read_yaml,
@@ -43,8 +44,10 @@ _KEYS = (
     "kd",
     "torque_limit",
 )
-_OPTIONAL_KEYS = ("joint_limits", "velocity_limit", "motor", "variants")
+_OPTIONAL_KEYS = ("joint_limits", "velocity_limit", "motor", "clearance", "variants")
 _MOTOR_KEYS = ("stall_torque", "no_load_speed")
+_CLEARANCE_SHARE = 0.25  # of the base height that feet should clear at most
+_USUAL_CLEARANCE = 0.3  # of the first keyframe's base height, where robot.yaml gives none
 _VARIANT = ":"  # between the names of a robot and of one of its variants
 
 
@@ -96,10 +99,18 @@ class Robot:
     foot_geoms: tuple[str, ...]
     foot_radius: float
     """Radius of the spherical feet in m."""
+    step_height: float
+    """Height that feet should clear in a step in m; less where the base is low."""
     keyframes: tuple[Keyframe, ...]
     """One a skill, in the order of keyframes.yaml."""
     folder: Path = field(repr=False)
     """Where robot.yaml, keyframes.yaml and the MJCF lie."""
+
+    @property
+    def clearance(self) -> np.ndarray:
+        """Height that feet should clear in a step of each skill. Shape (S,), m."""
+        lowest = [_CLEARANCE_SHARE * keyframe.base_height for keyframe in self.keyframes]
+        return np.minimum(self.step_height, lowest)
 
     @property
     def mjcf(self) -> Path:
@@ -191,6 +202,11 @@ def load_robot(name: str, root: Path = ROBOTS) -> Robot:
             for key in ("kp", "kd", "torque_limit", "action_scale")
         },
         joint_limits=joint_limits,
+        step_height=number(
+            entries.get("clearance", _USUAL_CLEARANCE * keyframes[0].base_height),
+            "clearance",
+            where,
+        ),
         velocity_limit=_optional("velocity_limit", entries, joints, where),
         motor=_motor(entries.get("motor"), joints, where),
         foot_radius=_foot_radius(model, parts["foot_geoms"]),

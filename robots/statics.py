@@ -14,6 +14,9 @@ from kiras_rl.robots.robot import Robot, RobotError
 FOOT_TOLERANCE = 0.005
 """m; a foot within this distance of the ground counts as standing on it."""
 
+LIMB_CLEARANCE = 0.005
+"""m; only feet stand on the ground: thighs, shanks and base are at least this far above it."""
+
 JOINT_MARGIN = 0.1
 """rad; a keyframe stays at least this far from joint limits: its steps need room, too."""
 
@@ -37,6 +40,8 @@ class KeyframeReport:
     """Full leg length minus the longest hip-to-foot distance in m; nan without two-link legs."""
     foot_height: np.ndarray
     """Height of each foot's lowest point above the ground. Shape (F,), m."""
+    limb_height: dict[str, float]
+    """Height of each limb's and the base's lowest point above the ground, by geom, in m."""
     torque: np.ndarray
     """Joint torques that hold the pose. Shape (J,), N m."""
     imbalance: float
@@ -63,6 +68,13 @@ class KeyframeReport:
             return (
                 f"{place}: the lowest foot is {abs(lowest):.3f} m {side} the ground: "
                 f"{verb} base_height by {abs(lowest):.3f} m in {path}"
+            )
+        limb = min(self.limb_height, key=self.limb_height.__getitem__)
+        if self.limb_height[limb] < LIMB_CLEARANCE:
+            return (
+                f"{place}: {limb} is {self.limb_height[limb]:.3f} m above the ground, "
+                f"{LIMB_CLEARANCE:g} m at least: change "
+                f"feet_ahead, base_height or joint_pos in {path}"
             )
         if self.imbalance > BALANCE_TOLERANCE:
             return (
@@ -115,9 +127,19 @@ def examine_keyframe(robot: Robot, keyframe: Keyframe) -> KeyframeReport:
         keyframe=keyframe,
         leg_margin=_leg_margin(model, keyframe, robot),
         foot_height=contacts[:, 2],
+        limb_height={
+            name: _height(model, data, name) for name in robot.penalised_geoms + robot.base_geoms
+        },
         torque=torque,
         imbalance=imbalance,
     )
+
+
+def _height(model: mujoco.MjModel, data: mujoco.MjData, geom: str) -> float:
+    """Return how far a geom is above the floor in m; negative within it."""
+    nothing = np.zeros(6)
+    ids = model.geom(geom).id, model.geom("floor").id
+    return float(mujoco.mj_geomDistance(model, data, *ids, 10.0, nothing))
 
 
 def _leg_margin(model: mujoco.MjModel, keyframe: Keyframe, robot: Robot) -> float:

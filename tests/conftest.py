@@ -12,6 +12,17 @@ from tape import Tape
 torch.set_num_threads(2)  # what CI has: the same order of sums, hence the same bits, on any machine
 
 
+@pytest.fixture(scope="session")
+def nominal():
+    """Return the overrides that leave nothing of the physics and the sensors random."""
+    from dataclasses import fields
+
+    from kiras_rl.schema import RandomizationConfig
+
+    kinds = [field.name for field in fields(RandomizationConfig)]
+    return tuple(f"env.randomization.{kind}=null" for kind in kinds if kind != "push_interval")
+
+
 @pytest.fixture(scope="session", autouse=True)
 def elsewhere(tmp_path_factory):
     """Run outside the checkout: MuJoCo drops its log there, and no path may count on the folder."""
@@ -113,6 +124,8 @@ def make_metadata():
             "kp": robot.kp,
             "kd": robot.kd,
             "torque_limit": robot.torque_limit,
+            "joint_limits": robot.joint_limits,
+            "velocity_limit": robot.velocity_limit,
             "action_scale": robot.action_scale,
             "action_clip": 6.0,
             "observation": [

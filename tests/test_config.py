@@ -310,7 +310,7 @@ def test_what_scales_a_term_is_a_number(override, shown):
 
 @pytest.mark.parametrize(("value", "shown"), [("abc", "'abc'"), ("null", "null"), ("[1]", "[1]")])
 def test_a_parameter_of_a_reward_is_a_number(value, shown):
-    key = "env.rewards.terms.foot_clearance.height"
+    key = "env.rewards.terms.short_swing.least"
     config = load_config("solo8", ["num_envs=1", f"{key}={value}"])
     with pytest.raises(ConfigError) as caught:
         make_env(config)

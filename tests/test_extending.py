@@ -63,7 +63,7 @@ def make_env(name: str, *overrides: str):
 def test_there_is_one_diff_an_example(extended):
     import kiras_rl
 
-    assert len(DIFFS) == len(re.findall(r"^## ", PAGE, re.MULTILINE)) == 6
+    assert len(DIFFS) == len(re.findall(r"^## ", PAGE, re.MULTILINE)) == 7
     assert Path(kiras_rl.__file__).is_relative_to(extended)
 
 
@@ -76,7 +76,8 @@ def test_a_skill_is_one_line():
     assert robot.skills.index("low_walk") == 5
     # two links of 0.16 m, hip 0.15 - 0.016 m above the centre of the foot
     thigh = np.arccos(0.134 / 2 / 0.16)
-    np.testing.assert_allclose(keyframe.joint_pos, 4 * [thigh, -2 * thigh], atol=1e-3)
+    front, hind = [thigh, -2 * thigh], [-thigh, 2 * thigh]  # knees inward
+    np.testing.assert_allclose(keyframe.joint_pos, 2 * front + 2 * hind, atol=1e-3)
     check_keyframe(robot, keyframe)
     env, _ = make_env("solo8_quick")
     assert env.get_observations()["skill"].shape == (4, 6)
@@ -89,6 +90,22 @@ def test_a_reward_is_a_function_and_a_line():
     v_z = env.measure().lin_vel_h[:, 2]
     assert v_z.abs().max() > 0.01
     torch.testing.assert_close(log["Reward/lin_vel_z"], -0.5 * v_z.square().mean())
+
+
+def test_a_reward_may_remember_what_it_needs():
+    env, _ = make_env("solo8_soft", "env.commands.zero_probability=0")
+    falling, in_air, landed = torch.zeros(4, 4), torch.zeros(4, 4) > 0, 0
+    for _ in range(40):
+        _, _, dones, extras = env.step(1.5 * torch.randn(4, 8))
+        stands = env.measure().foot_stands
+        landing = stands & in_air
+        expected = -0.2 * (falling * landing).sum(1).mean()
+        torch.testing.assert_close(extras["log"]["Reward/hard_landing"], expected)
+        landed += landing.sum()
+        speed = (-env.robot.foot_vel_w[..., 2]).clamp(min=0.0)
+        falling = torch.where(stands | dones[:, None], 0.0, speed)
+        in_air = ~stands & ~dones[:, None]
+    assert landed > 5
 
 
 def test_an_observation_reaches_the_robot(tmp_path):

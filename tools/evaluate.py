@@ -136,7 +136,7 @@ def chosen(names: list[str] | None, subjects: list[Subject]) -> list[str]:
 
 
 def _defaults(subjects: list[Subject]) -> list[str]:
-    names = ["flat", "imitation", "transitions", "sampling", "learning"]
+    names = ["flat", "imitation", "limits", "transitions", "sampling", "learning"]
     return names + ["terrain"] * any(subject.is_finetuned for subject in subjects)
 
 

@@ -42,8 +42,9 @@ def trained_config(metadata: PolicyMetadata) -> Config:
 
 
 def standard_config(robot: str) -> Config:
-    """Return the configuration of a robot's own name, else `base`."""
-    return load_config(robot if robot in list_configs() else "base")
+    """Return the configuration of a robot's own name, without that of a variant, else `base`."""
+    name = robot.partition(":")[0]
+    return load_config(name if name in list_configs() else "base")
 
 
 def evaluation_physics(config: Config, nominal: bool) -> Config:

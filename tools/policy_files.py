@@ -51,7 +51,7 @@ def load_policy(source: Path | None, robot: str | None = None) -> OnboardPolicy:
 def robot_of(metadata: PolicyMetadata) -> Robot:
     """Return a policy's robot as it was in training, whatever its folder says today.
 
-    Keyframes, default pose, gains, torque limits and action scales are those of the policy file.
+    Keyframes, default pose, gains, limits and action scales are those of the policy file.
 
     Raises:
         RobotError: If the robot of the policy is unknown or has other joints.
@@ -59,9 +59,13 @@ def robot_of(metadata: PolicyMetadata) -> Robot:
     robot = load_robot(metadata.robot)
     check_joints(robot, metadata)
     arrays = ("default_joint_pos", "kp", "kd", "torque_limit", "action_scale")
+    unlimited = np.full((len(robot.joint_names), 2), (-np.inf, np.inf))
+    limits, speeds = metadata.joint_limits, metadata.velocity_limit
     return replace(
         robot,
         keyframes=tuple(_keyframe(metadata, skill) for skill in metadata.skills),
+        joint_limits=unlimited if limits is None else np.array(limits),
+        velocity_limit=unlimited[:, 1] if speeds is None else np.array(speeds),
         **{name: np.array(getattr(metadata, name)) for name in arrays},
     )
 

@@ -364,7 +364,8 @@ def _conclude(runner: KirasRunner) -> None:
     evaluators, policy = runner.evaluators, onboard_policy(OnboardPolicy(onnx))
     if evaluators.flat:
         results = {name: asdict(result) for name, result in evaluators.flat(policy).items()}
-        console.print(as_rich(flat.table({run_dir.name: results}, "Best policy, flat ground")))
+        for table in flat.tables({run_dir.name: results}, "Best policy, flat ground"):
+            console.print(as_rich(table))
     if evaluators.terrain:
         console.print(as_rich(terrain.result_table(evaluators.terrain(policy))))
     folder = shlex.quote(str(run_dir))

@@ -13,16 +13,24 @@ from typing import Protocol
 import mujoco
 import torch
 
-BODY_FIELDS = ("body_mass", "body_ipos", "body_subtreemass", "body_invweight0", "dof_invweight0")
-"""Masses, centres of mass, and the constants that follow from them (mj_setConst)."""
+BODY_FIELDS = (
+    "body_mass",
+    "body_ipos",
+    "body_inertia",
+    "body_subtreemass",
+    "body_invweight0",
+    "dof_invweight0",
+)
+"""Masses, centres of mass, inertias, and the constants that follow from them (mj_setConst)."""
 
 RANDOMISED_FIELDS = (
     *BODY_FIELDS,
     "geom_friction",
     "actuator_gainprm",
-    "actuator_biasprm",
     "actuator_delay",
     "actuator_forcerange",
+    "dof_frictionloss",
+    "dof_damping",
 )
 """Fields of MjModel that hold one value a world."""
 

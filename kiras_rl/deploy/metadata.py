@@ -65,7 +65,10 @@ class PolicyMetadata:
 
     Joint quantities follow `joint_names`: angles in rad, gains in N m/rad and N m s/rad, torques
     in N m.
-    A joint target is `default_joint_pos + action_scale * clip(action, -action_clip, action_clip)`.
+    A joint target is `default_joint_pos + action_scale * clip(action, -action_clip, action_clip)`,
+    clipped to `joint_limits`, (lowest, highest) per joint in rad. They and `velocity_limit`, in
+    rad/s, are None in a file that was written before files held them; infinite for a joint that
+    has none.
     `history_length` counts the past frames, without the current one; `control_rate` is in Hz.
     `provenance` is free: what made the file, for people to read.
 
@@ -89,6 +92,8 @@ class PolicyMetadata:
     command_range: CommandRange
     version: str
     provenance: dict[str, Any] = field(default_factory=dict)
+    joint_limits: tuple[tuple[float, float], ...] | None = None
+    velocity_limit: tuple[float, ...] | None = None
 
     def __post_init__(self) -> None:
         """Check lengths, names and signs, so that nothing later has to."""
@@ -119,7 +124,10 @@ class PolicyMetadata:
 
     def to_json(self) -> str:
         """Return the JSON text that travels in the policy file."""
-        return json.dumps(self.to_dict(), default=str)  # provenance may hold anything
+        values = self.to_dict()
+        for name in _LATER:
+            values[name] = _without_infinity(values[name])
+        return json.dumps(values, default=str)  # provenance may hold anything
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> PolicyMetadata:
@@ -136,9 +144,10 @@ class PolicyMetadata:
             f"format {given} was given, and this version of kiras-rl reads format {FORMAT}: "
             "export the policy again, or install the version that wrote it",
         )
-        missing = [name for name in _READERS if name not in data]
+        missing = [name for name in _READERS if name not in data and name not in _LATER]
         _require(not missing, f"missing: {', '.join(missing)}")
-        return cls(**{name: _read(name, reader, data[name]) for name, reader in _READERS.items()})
+        known = {n: read for n, read in _READERS.items() if n not in _LATER or data.get(n)}
+        return cls(**{name: _read(name, reader, data[name]) for name, reader in known.items()})
 
     @classmethod
     def from_json(cls, text: str) -> PolicyMetadata:
@@ -161,6 +170,15 @@ class PolicyMetadata:
                 count == self.num_joints,
                 f"{name} holds {count} numbers for {self.num_joints} joints",
             )
+        for name in _LATER:
+            given = getattr(self, name)
+            _require(
+                given is None or len(given) == self.num_joints,
+                f"{name} holds {0 if given is None else len(given)} entries for "
+                f"{self.num_joints} joints",
+            )
+        for low, high in self.joint_limits or ():
+            _require(low < high, f"joint_limits hold ({low}, {high}): the lower number comes first")
         _require(all(scale > 0 for scale in self.action_scale), "action_scale must be positive")
 
     def _check_skills(self) -> None:
@@ -233,6 +251,26 @@ def _postures(values: Mapping[str, Mapping[str, Any]]) -> dict[str, Posture]:
     }
 
 
+def _limits(values: Sequence[Any]) -> tuple[tuple[float, float], ...]:
+    return tuple((_limit(low, -math.inf), _limit(high, math.inf)) for low, high in values)
+
+
+def _without_infinity(values: Any) -> Any:
+    """Return nested numbers with None for those that are infinite: JSON has no infinity."""
+    if isinstance(values, list | tuple):
+        return [_without_infinity(value) for value in values]
+    return None if values is not None and math.isinf(values) else values
+
+
+def _largest(values: Sequence[Any]) -> tuple[float, ...]:
+    return tuple(_limit(value, math.inf) for value in values)
+
+
+def _limit(value: Any, none: float) -> float:
+    """Read a number, or None for no limit; infinity, which JSON does not have, is none either."""
+    return none if value is None or math.isinf(value) else _number(value)
+
+
 def _interval(values: Sequence[Any]) -> tuple[float, float]:
     low, high = _numbers(values)
     return low, high
@@ -243,6 +281,9 @@ def _command_range(values: Mapping[str, Any]) -> CommandRange:
     return CommandRange(**{axis: _interval(values[axis]) for axis in axes})
 
 
+_LATER = ("joint_limits", "velocity_limit")
+"""Entries that files of the first versions lack."""
+
 _READERS: dict[str, Callable[[Any], Any]] = {
     "robot": str,
     "joint_names": _names,
@@ -250,6 +291,8 @@ _READERS: dict[str, Callable[[Any], Any]] = {
     "kp": _numbers,
     "kd": _numbers,
     "torque_limit": _numbers,
+    "joint_limits": _limits,
+    "velocity_limit": _largest,
     "action_scale": _numbers,
     "action_clip": _number,
     "observation": _terms,

@@ -69,6 +69,8 @@ class OnboardPolicy:
         meta = self.metadata
         self._default = np.array(meta.default_joint_pos)
         self._scale = np.array(meta.action_scale)
+        limits = meta.joint_limits or [(-np.inf, np.inf)] * meta.num_joints
+        self._low, self._high = np.array(limits).T
         self._terms = [(_TERMS[term.name], term.scale) for term in meta.observation]
         self._one_hot = np.eye(len(meta.skills))
         self._started = False
@@ -108,7 +110,7 @@ class OnboardPolicy:
             skill: Name of a skill, or its index in `metadata.skills`.
 
         Returns:
-            Joint targets, (J,), rad.
+            Joint targets within `metadata.joint_limits`, (J,), rad.
 
         Raises:
             PolicyError: If a reading has another length, is not finite or beyond LARGEST_READING,
@@ -180,7 +182,7 @@ class OnboardPolicy:
         clip = self.metadata.action_clip
         self.action = np.clip(actions[0].astype(np.float64), -clip, clip)
         self.velocity = velocity[0].astype(np.float64)
-        return self._default + self._scale * self.action
+        return np.clip(self._default + self._scale * self.action, self._low, self._high)
 
     def _vector(self, name: str, values: ArrayLike, size: int) -> np.ndarray:
         try:

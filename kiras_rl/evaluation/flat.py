@@ -9,14 +9,44 @@ from dataclasses import asdict, dataclass
 import torch
 from tensordict import TensorDict
 
+from kiras_rl.evaluation.gait import clearance, lifts_per_second
 from kiras_rl.interfaces import Measurements, SkillEnv
 
 SETTLE = 1.0  # s that are not counted
 AVERAGE = 0.4  # s of the moving average of height and pitch: about two strides
 SEED = 12345  # every evaluation draws the same robots
 
-FLOOR = {"height": 0.03, "pitch": math.radians(5.0), "velocity": 0.12, "falls": 0.05}
-"""What a skill must reach to be called learned: m, rad, m/s, share of robots."""
+
+@dataclass(frozen=True)
+class Goal:
+    """What a skill should reach, each at most unless said otherwise.
+
+    Attributes:
+        height: Error of the height, m.
+        pitch: Error of the pitch, rad.
+        velocity: Error of v_x, m/s.
+        falls: Share of robots.
+        lifts: Lifts a second, the least and the most.
+        clearance: Share of the height that steps of this skill should have, at least.
+        beyond: Share of the control steps with a joint beyond its limits.
+        saturated: Share of the physics steps with a motor that gives all it can.
+    """
+
+    height: float
+    pitch: float
+    velocity: float
+    falls: float
+    lifts: tuple[float, float]
+    clearance: float
+    beyond: float
+    saturated: float
+
+
+FLOOR = Goal(0.03, math.radians(5.0), 0.12, 0.05, (1.0, 4.5), 0.5, 0.01, 0.05)
+"""What a skill must reach to be called learned."""
+
+TARGET = Goal(0.01, math.radians(2.0), 0.08, 0.0, (2.0, 3.5), 1.0, 0.0, 0.001)
+"""What a skill should reach."""
 
 Policy = Callable[[TensorDict], torch.Tensor]
 
@@ -33,6 +63,13 @@ class SkillResult:
         pitch_error: Mean |pitch - keyframe| of the moving average, rad.
         velocity_error: Mean |v_x - command|, at each step, m/s.
         lifts: Lifts a second of the foot that lifts least.
+        most_lifts: Lifts a second of the foot that lifts most.
+        clearance: Mean over swings of the largest height of the foot above the ground, of the
+            height that steps of this skill should have.
+        duty: Share of the time that a foot stands, mean over feet.
+        beyond: Share of the control steps with a joint beyond its limits.
+        saturated: Share of the physics steps with a motor that gives all that it can.
+        power: Mean of the sum over the joints of |torque * velocity|, W.
         distinct: Share of robots whose mean height and pitch are nearest their own keyframe.
         falls: Share of robots that fell.
     """
@@ -44,17 +81,27 @@ class SkillResult:
     pitch_error: float
     velocity_error: float
     lifts: float
+    most_lifts: float
+    clearance: float
+    duty: float
+    beyond: float
+    saturated: float
+    power: float
     distinct: float
     falls: float
 
-    def meets(self, height: float, pitch: float, velocity: float, falls: float) -> bool:
-        """Return whether errors (m, rad, m/s) and falls stay within limits and the robot steps."""
+    def meets(self, goal: Goal) -> bool:
+        """Return whether posture, velocity, gait and limits all reach a goal."""
         return (
-            self.height_error <= height
-            and self.pitch_error <= pitch
-            and self.velocity_error <= velocity
-            and self.falls <= falls
-            and self.lifts >= 1.0
+            self.height_error <= goal.height
+            and self.pitch_error <= goal.pitch
+            and self.velocity_error <= goal.velocity
+            and self.falls <= goal.falls
+            and goal.lifts[0] <= self.lifts
+            and self.most_lifts <= goal.lifts[1]
+            and self.clearance >= goal.clearance
+            and self.beyond <= goal.beyond
+            and self.saturated <= goal.saturated
         )
 
 
@@ -67,7 +114,11 @@ class Recording:
     height: torch.Tensor  # (T, N)
     pitch: torch.Tensor  # (T, N)
     velocity: torch.Tensor  # (T, N)
-    contact: torch.Tensor  # (T, N, F)
+    stands: torch.Tensor  # (T, N, F)
+    foot_height: torch.Tensor  # (T, N, F)
+    beyond: torch.Tensor  # (T, N)
+    saturated: torch.Tensor  # (T, N)
+    power: torch.Tensor  # (T, N)
     alive: torch.Tensor  # (T, N): not fallen up to and including this step
     step_dt: float
 
@@ -111,11 +162,20 @@ def record(
 ) -> Recording:
     """Walk as `walk` does, and keep what the protocol counts."""
     steps = [
-        (now.base_height, now.pitch, now.lin_vel_h[:, 0], now.foot_contact, alive)
+        (
+            *(now.base_height, now.pitch, now.lin_vel_h[:, 0], now.foot_stands, now.foot_height),
+            *(now.beyond, now.saturated, power(now), alive),
+        )
         for now, alive in walk(env, policy, duration, skill, command)
     ]
-    height, pitch, velocity, contact, alive = (torch.stack(x) for x in zip(*steps, strict=True))
-    return Recording(skill, command, height, pitch, velocity, contact, alive, env.step_dt)
+    return Recording(
+        skill, command, *(torch.stack(x) for x in zip(*steps, strict=True)), step_dt=env.step_dt
+    )
+
+
+def power(now: Measurements) -> torch.Tensor:
+    """Return the sum over the joints of |torque * velocity|, (N,), W."""
+    return (now.joint_torque * now.joint_vel).abs().sum(dim=-1)
 
 
 def deal_skills(env: SkillEnv, command: float) -> tuple[torch.Tensor, torch.Tensor]:
@@ -149,9 +209,17 @@ def per_robot(recording: Recording, env: SkillEnv) -> dict[str, torch.Tensor]:
         "pitch": mean_where(recording.pitch, weight),
         "velocity": mean_where(velocity, weight),
         "velocity_error": mean_where((velocity - recording.command[:, 0]).abs(), weight),
-        "lifts": lifts_per_second(recording.contact, counted, recording.step_dt).amin(dim=-1),
+        "duty": mean_where(recording.stands.float().mean(dim=-1), weight),
+        "beyond": mean_where(recording.beyond.float(), weight),
+        "saturated": mean_where(recording.saturated, weight),
+        "power": mean_where(recording.power, weight),
         "falls": 1.0 - recording.alive[-1].float(),
     }
+    lifts = lifts_per_second(recording.stands, counted, recording.step_dt)
+    values |= {"lifts": lifts.amin(dim=-1), "most_lifts": lifts.amax(dim=-1)}
+    peaks, swings = clearance(recording.stands, recording.foot_height, counted)
+    wanted = env.keyframe_clearance[recording.skill]
+    values["clearance"] = peaks / swings.clamp(min=1.0) / wanted
     errors = posture_errors(recording.height, recording.pitch, recording.skill, env)
     for name, error in zip(("height_error", "pitch_error"), errors, strict=True):
         values[name] = mean_where(error, weight)
@@ -192,29 +260,22 @@ def moving_average(signal: torch.Tensor, step_dt: float) -> torch.Tensor:
     return padded.unfold(0, width, 1).mean(dim=-1)
 
 
-def lifts_per_second(contact: torch.Tensor, alive: torch.Tensor, step_dt: float) -> torch.Tensor:
-    """Return how often each foot leaves the ground before the robot falls, (N, F), 1/s.
-
-    Args:
-        contact: (T, N, F) bool.
-        alive: Steps that count, all before the fall, (T, N) bool.
-        step_dt: s.
-    """
-    lifted = contact[:-1] & ~contact[1:] & (alive[:-1] & alive[1:])[:, :, None]
-    return lifted.sum(dim=0) / (alive.sum(dim=0).clamp(min=1)[:, None] * step_dt)
-
-
 def score(results: dict[str, SkillResult]) -> float:
     """Return one number for "how good is this policy": lower is better, 0 is perfect.
 
-    Errors are measured against the limits that make skills useful (3 cm, 5 degrees, 0.12 m/s); a
-    fall or a skill that does not step costs as much as an error at its limit.
+    Errors are measured against FLOOR, which makes skills useful; a skill that does not step, steps
+    as low as the floor or a lift a second too often, or is beyond its limits in all steps costs as
+    much as an error at its limit.
     """
     parts = [
-        r.height_error / 0.03
-        + r.pitch_error / 0.087
-        + r.velocity_error / 0.12
+        r.height_error / FLOOR.height
+        + r.pitch_error / FLOOR.pitch
+        + r.velocity_error / FLOOR.velocity
         + max(0.0, 1.0 - r.lifts)
+        + max(0.0, r.most_lifts - TARGET.lifts[1])
+        + 2.0 * max(0.0, 1.0 - r.clearance)
+        + r.beyond
+        + r.saturated
         + 2.0 * r.falls
         for r in results.values()
     ]

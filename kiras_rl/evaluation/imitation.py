@@ -14,7 +14,8 @@ from dataclasses import asdict, dataclass
 import torch
 
 from kiras_rl.evaluation.dtw import frame_distances
-from kiras_rl.evaluation.flat import SETTLE, Policy, deal_skills, lifts_per_second, walk
+from kiras_rl.evaluation.flat import SETTLE, Policy, deal_skills, power, walk
+from kiras_rl.evaluation.gait import clearance, lifts_per_second
 from kiras_rl.interfaces import SkillEnv
 
 STEPS = 120  # counted, after SETTLE seconds that are not [paper]
@@ -99,9 +100,10 @@ class Motion:
     velocity: torch.Tensor  # (T, N)
     gravity_b: torch.Tensor  # (T, N, 3)
     joint_pos: torch.Tensor  # (T, N, J)
-    joint_vel: torch.Tensor  # (T, N, J)
+    peak_torque: torch.Tensor  # (T, N, J)
     joint_torque: torch.Tensor  # (T, N, J)
-    contact: torch.Tensor  # (T, N, F)
+    power: torch.Tensor  # (T, N)
+    stands: torch.Tensor  # (T, N, F)
     foot_height: torch.Tensor  # (T, N, F)
     alive: torch.Tensor  # (T, N): not fallen up to and including this step
     step_dt: float
@@ -130,9 +132,8 @@ def record_motion(env: SkillEnv, policy: Policy, command: float) -> Motion:
     steps = [
         (
             *(now.base_height, now.pitch, now.lin_vel_h[:, 0], now.gravity_b),
-            *(now.joint_pos, now.joint_vel, now.joint_torque, now.foot_contact),
-            now.base_height[:, None] + env.foot_height_b(now.gravity_b, now.joint_pos),
-            alive,
+            *(now.joint_pos, now.peak_torque, now.joint_torque, power(now)),
+            *(now.foot_stands, now.foot_height, alive),
         )
         for now, alive in walk(env, policy, (start + STEPS) * env.step_dt, skill, commands)
     ]
@@ -176,7 +177,7 @@ def summarize(motion: Motion, env: SkillEnv) -> Imitation:
             dtw=STEPS * values["dtw_frame"],
             dtw_std=STEPS * _spread(per_robot["dtw_frame"][counted]),
             accuracy=confusion[-1][index].item(),
-            clearance=clearance(motion, counted),
+            clearance=_clearance(motion, counted),
             cost_of_transport=_cost(values["power"], env.mass, values["velocity"]),
             falls=1.0 - motion.alive[-1, mine].float().mean().item(),
         )
@@ -202,14 +203,13 @@ def _posture(motion: Motion, env: SkillEnv) -> dict[str, torch.Tensor]:
 def _gait(motion: Motion) -> dict[str, torch.Tensor]:
     """Return how each robot moved, (N,) each."""
     torque, alive = motion.joint_torque.abs(), motion.alive
-    power = (motion.joint_torque * motion.joint_vel).abs().sum(dim=-1)
     return {
         "velocity": _mean(motion.velocity, alive),
-        "frequency": lifts_per_second(motion.contact, alive, motion.step_dt).mean(dim=-1),
-        "duty": _mean(motion.contact.float().mean(dim=-1), alive),
+        "frequency": lifts_per_second(motion.stands, alive, motion.step_dt).mean(dim=-1),
+        "duty": _mean(motion.stands.float().mean(dim=-1), alive),
         "torque": _mean(torque.mean(dim=-1), alive),
-        "peak_torque": torch.where(alive, torque.amax(dim=-1), 0.0).amax(dim=0),
-        "power": _mean(power, alive),
+        "peak_torque": torch.where(alive, motion.peak_torque.amax(dim=-1), 0.0).amax(dim=0),
+        "power": _mean(motion.power, alive),
     }
 
 
@@ -220,30 +220,12 @@ def _shares_nearest(motion: Motion, keyframes: torch.Tensor) -> torch.Tensor:
     return _mean(nearest, motion.alive[..., None])
 
 
-def clearance(motion: Motion, robots: torch.Tensor) -> float:
-    """Return the mean of the largest foot heights of all whole swings of some robots (N,), m.
-
-    A swing is whole if the foot lifted and landed within the steps that count, before a fall.
-    """
-    peaks = []
-    contact = motion.contact[:, robots].flatten(1).T.tolist()  # one row a foot
-    height = motion.foot_height[:, robots].flatten(1).T.tolist()
-    steps = motion.alive[:, robots].sum(dim=0).repeat_interleave(motion.contact.shape[-1]).tolist()
-    for stands, heights, count in zip(contact, height, steps, strict=True):
-        peaks += _swing_peaks(stands[:count], heights[:count])
-    return sum(peaks) / len(peaks) if peaks else math.nan
-
-
-def _swing_peaks(stands: list[bool], heights: list[float]) -> list[float]:
-    """Return the largest height of each whole swing of a foot."""
-    peaks, peak = [], None
-    for step in range(1, len(stands)):
-        if stands[step]:
-            peaks += [] if peak is None else [peak]
-            peak = None
-        elif stands[step - 1] or peak is not None:
-            peak = max(heights[step], -math.inf if peak is None else peak)
-    return peaks
+def _clearance(motion: Motion, robots: torch.Tensor) -> float:
+    """Return the mean of the largest foot heights of all whole swings of some robots (N,), m."""
+    peaks, swings = clearance(
+        motion.stands[:, robots], motion.foot_height[:, robots], motion.alive[:, robots]
+    )
+    return (peaks.sum() / swings.sum()).item()  # NaN without a swing
 
 
 def _mean(signal: torch.Tensor, alive: torch.Tensor) -> torch.Tensor:

@@ -118,7 +118,7 @@ def _keeps(
     height_error, pitch_error = (
         mean_where(error, running.float()) for error in posture_errors(height, pitch, skill, env)
     )
-    return (height_error <= FLOOR["height"]) & (pitch_error <= FLOOR["pitch"])
+    return (height_error <= FLOOR.height) & (pitch_error <= FLOOR.pitch)
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,9 @@ def env():
     return make_env(load_config("solo8_quick", overrides), "cpu", num_envs=2)
 
 
-def test_frames_histories_and_actions_are_those_of_training(env, make_policy, tmp_path):
+def test_frames_actions_and_targets_are_those_of_training(env, make_policy, tmp_path, monkeypatch):
+    sent, step = [], env.sim.step
+    monkeypatch.setattr(env.sim, "step", lambda ctrl: sent.append(ctrl[0].numpy()) or step(ctrl))
     header = {"format": FORMAT, "version": __version__, "provenance": {}}
     metadata = PolicyMetadata.from_dict(header | env.describe())
     policy = make_policy(metadata, gain=1.0)
@@ -37,12 +39,17 @@ def test_frames_histories_and_actions_are_those_of_training(env, make_policy, tm
             onboard.reset(qpos[7:])  # a reset aims at the joint angles that it draws
             starts += 1
         command, skill = obs["command"][0].numpy(), obs["skill"][0].argmax().item()
-        onboard.step(qpos[7:], qvel[6:], qpos[3:7], qvel[3:6], command, skill)
+        target = onboard.step(qpos[7:], qvel[6:], qpos[3:7], qvel[3:6], command, skill)
         with torch.no_grad():
             actions = policy(obs["proprio"], obs["history"])[0]
         np.testing.assert_allclose(onboard.frame, obs["proprio"][0], atol=1e-4)
         np.testing.assert_allclose(onboard.history.ravel(), obs["history"][0], atol=1e-4)
         np.testing.assert_allclose(onboard.action, actions[0].clamp(-6, 6), atol=1e-3)
         obs, _, done, _ = env.step(actions)
+        np.testing.assert_allclose(target, sent[-1], atol=1e-3)
         begun = bool(done[0])
     assert starts > 2  # histories began anew
+    low, high = np.array(metadata.joint_limits).T
+    at_limit = [np.isclose(t, low, atol=1e-5) | np.isclose(t, high, atol=1e-5) for t in sent]
+    assert np.mean(at_limit) > 0.01  # some targets were beyond the limits
+    assert all((t >= low - 1e-5).all() and (t <= high + 1e-5).all() for t in sent)

@@ -47,6 +47,40 @@ def test_what_does_not_fit_is_named(make_metadata, changes, message):
         make_metadata(**changes)
 
 
+INF = float("inf")
+
+
+def test_limits_may_be_missing_for_some_joints(make_metadata):
+    limits = ((-1.0, 2.0), (-INF, 1.5), *[(-INF, INF)] * 6)
+    metadata = make_metadata(joint_limits=limits, velocity_limit=[30.0] * 7 + [INF])
+    assert metadata.joint_limits == limits
+    assert metadata.velocity_limit == (30.0,) * 7 + (INF,)
+    text = metadata.to_json()
+    assert "Infinity" not in text  # no JSON
+    assert PolicyMetadata.from_json(text) == metadata
+
+
+def test_files_of_the_first_versions_have_no_limits(make_metadata):
+    data = make_metadata().to_dict()
+    del data["joint_limits"], data["velocity_limit"]
+    metadata = PolicyMetadata.from_dict(data)
+    assert metadata.joint_limits is None and metadata.velocity_limit is None
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"joint_limits": [[-1.0, 1.0]] * 7}, "joint_limits holds 7 entries for 8 joints"),
+        ({"joint_limits": [[1.0, -1.0]] * 8}, r"joint_limits hold \(1.0, -1.0\): the lower"),
+        ({"joint_limits": [1.0] * 8}, "joint_limits cannot be read"),
+        ({"velocity_limit": [1.0]}, "velocity_limit holds 1 entries for 8 joints"),
+    ],
+)
+def test_limits_that_do_not_fit_are_named(make_metadata, changes, message):
+    with pytest.raises(PolicyError, match=message):
+        make_metadata(**changes)
+
+
 def test_a_missing_value_is_named(make_metadata):
     data = make_metadata().to_dict()
     del data["kp"], data["version"]

@@ -13,8 +13,8 @@ import torch
 from kiras_rl.deploy.policy import OnboardPolicy, PolicyError
 from kiras_rl.export import export_policy
 
-DEFAULT = np.array([0.8, -1.6] * 4)
-CRAWL = np.array([1.3, -2.6] * 4)
+DEFAULT = np.array([0.8, -1.6] * 2 + [-0.8, 1.6] * 2)
+CRAWL = DEFAULT + np.array([0.5, -1.0] * 4)
 LEVEL = (1.0, 0.0, 0.0, 0.0)
 
 
@@ -103,6 +103,16 @@ def test_the_action_goes_into_the_next_frame(policy):
 def test_the_target_is_default_plus_scaled_action(policy):
     target = step(policy)
     np.testing.assert_allclose(target, DEFAULT + 0.5 * policy.action)
+
+
+def test_targets_are_clipped_to_the_joint_limits(make_metadata, make_policy, tmp_path):
+    metadata = make_metadata(joint_limits=[[-0.9, 0.85], [-1.7, 1.7]] * 4)
+    networks = make_policy(metadata, gain=100.0)  # actions far beyond
+    export_policy(networks, metadata, tmp_path / "a.onnx")
+    target = step(OnboardPolicy(tmp_path / "a.onnx"))
+    low, high = np.array(metadata.joint_limits).T
+    assert (target >= low).all() and (target <= high).all()
+    assert ((target == low) | (target == high)).any()
 
 
 def test_actions_are_clipped(make_metadata, make_policy, tmp_path):

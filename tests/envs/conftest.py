@@ -18,8 +18,8 @@ class Drill:
 
     def __init__(self, library=None):
         self.robot = load_robot("solo8")
-        self.scene = build_scene(
-            self.robot, timestep=0.005, solver_iterations=10, max_delay=3, library=library
+        self.scene = build_scene(  # dry friction of joints takes many iterations to converge
+            self.robot, timestep=0.005, solver_iterations=60, max_delay=3, library=library
         )
         self.scene.model.opt.tolerance = 1e-8  # backends agree where their solvers converge
         frames = [torch.tensor(k.qpos) for k in self.robot.keyframes[:WORLDS]]
@@ -84,7 +84,7 @@ def make_drill():
 def build(drill):
     """Return a function that builds a simulation: native, warp (on the CPU) or cuda (warp)."""
 
-    def make(name, model=drill.scene.model, max_contacts=24, max_constraints=96, **options):
+    def make(name, model=drill.scene.model, max_contacts=24, max_constraints=112, **options):
         if name == "native":
             from kiras_rl.envs.simulation.native import NativeSimulation
 

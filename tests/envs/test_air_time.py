@@ -22,7 +22,7 @@ def test_feet_are_paid_for_the_time_since_they_last_stood(build_env):
     earned = ended = 0
     for _ in range(60):
         _, rewards, done, _ = env.step(1.5 * torch.randn(8, env.num_actions))
-        contact = env.measure().foot_contact
+        contact = env.measure().foot_stands
         landing = contact & (in_air > 0)
         torch.testing.assert_close(rewards, ((in_air - TARGET) * landing).sum(1))
         in_air = torch.where(contact | done[:, None], 0.0, in_air + env.step_dt)

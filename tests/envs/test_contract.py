@@ -15,11 +15,6 @@ from kiras_rl.robots.robot import list_robots, load_robot
 WORLDS = 10
 UPSIDE_DOWN = [0.0, 1.0, 0.0, 0.0]
 STILL = ("env.skills.joint_noise=0", "env.skills.velocity_noise=0")
-NOMINAL = [
-    f"env.randomization.{name}=null"
-    for name in ("friction", "payload", "com_shift", "kp_factor", "kd_factor", "action_delay",
-                 "push_velocity")
-]  # fmt: skip
 
 
 @pytest.fixture(params=list_robots())
@@ -100,8 +95,8 @@ def test_measurements_outlive_the_next_step(env):
     assert all(torch.equal(getattr(now, name), value) for name, value in kept.items())
 
 
-def test_the_height_of_the_feet_follows_from_what_is_measured(robot, build_env):
-    env = build_env(f"robot={robot.name}", *NOMINAL, num_envs=WORLDS)
+def test_the_height_of_the_feet_follows_from_what_is_measured(robot, build_env, nominal):
+    env = build_env(f"robot={robot.name}", *nominal, num_envs=WORLDS)
     env.step(actions(env))
     now = env.measure()
     height = now.base_height[:, None] + env.foot_height_b(now.gravity_b, now.joint_pos)
@@ -204,10 +199,10 @@ def test_skills_are_drawn_by_their_probabilities(build_env):
     torch.testing.assert_close(drawn, probabilities, atol=0.08, rtol=0)  # 4 standard deviations
 
 
-def test_skills_and_commands_change_now_and_then_within_an_episode(build_env):
+def test_skills_and_commands_change_now_and_then_within_an_episode(build_env, nominal):
     env = build_env(
         "env.skills.switch_probability=0.1", "env.commands.resample_probability=0.2", *STILL,
-        *NOMINAL, num_envs=250,
+        *nominal, num_envs=250,
     )  # fmt: skip
     before = env.get_observations()
     after, _, dones, _ = env.step(hold(env))
@@ -223,7 +218,7 @@ def test_commands_stay_in_their_ranges_and_some_ask_to_stand(build_env):
     stands = (command == 0).all(dim=1)
     assert stands.float().mean().item() == pytest.approx(0.1, abs=0.054)
     low, high = command.amin(dim=0), command.amax(dim=0)
-    torch.testing.assert_close(low, torch.tensor([-0.3, -0.1, -0.6]), atol=0.03, rtol=0)
+    torch.testing.assert_close(low, torch.tensor([-0.4, -0.1, -0.6]), atol=0.03, rtol=0)
     torch.testing.assert_close(high, torch.tensor([0.6, 0.2, 0.6]), atol=0.03, rtol=0)
 
 
@@ -232,10 +227,10 @@ def test_no_moving_command_is_slower_than_the_least(build_env):
     forward = env.reset()[names.COMMAND][:, 0]
     moving = forward[forward != 0]
     assert moving.abs().min() == pytest.approx(0.25)
-    # Of -0.3 to 0.6 m/s, 3 in 9 go backwards, 5 in 9 are raised to the least.
-    assert (moving < 0).float().mean().item() == pytest.approx(3 / 9, abs=0.1)
+    # Of -0.4 to 0.6 m/s, 4 in 10 go backwards, 5 in 10 are raised to the least.
+    assert (moving < 0).float().mean().item() == pytest.approx(4 / 10, abs=0.1)
     slowest = moving.abs() < 0.25 + 1e-6
-    assert slowest.float().mean().item() == pytest.approx(5 / 9, abs=0.1)
+    assert slowest.float().mean().item() == pytest.approx(5 / 10, abs=0.1)
 
 
 # --- ends ----------------------------------------------------------------------------------------
@@ -270,7 +265,7 @@ def test_a_fall_ends_an_episode_and_is_no_time_out(env):
     assert torch.equal(extras[names.EXTRA_TIME_OUTS], ~fallen)
     assert dones.all()
     assert extras["log"]["Episode/falls"] == 2 and extras["log"]["Episode/time_outs"] == WORLDS - 2
-    assert rewards[fallen].max() < rewards[~fallen].min()
+    assert rewards[fallen].mean() < rewards[~fallen].mean() - 1.0
     assert extras["log"]["Reward/termination"].item() == pytest.approx(-2.0 * 2 / WORLDS)
 
 
@@ -285,8 +280,8 @@ def test_a_trunk_on_the_ground_is_a_fall(robot, build_env):
     assert fallen.tolist() == [False, True, False]
 
 
-def test_a_lean_is_judged_from_the_nearer_of_target_and_start(build_env):
-    env = build_env("env.terminations.max_tilt=20", *STILL, *NOMINAL, num_envs=4)
+def test_a_lean_is_judged_from_the_nearer_of_target_and_start(build_env, nominal):
+    env = build_env("env.terminations.max_tilt=20", *STILL, *nominal, num_envs=4)
     pitch_up = torch.full((4,), env.skills.index("pitch_up"))
     env.reset(pitch_up, torch.zeros(4, 3))  # 15 degrees nose up
     env.set_task(torch.tensor([3, 4, 0, 4]), torch.zeros(4, 3))  # itself, or 30 degrees away
@@ -301,8 +296,8 @@ def test_a_lean_is_judged_from_the_nearer_of_target_and_start(build_env):
     assert env.measure().fallen.tolist() == [True, False, False, False]
 
 
-def test_a_lean_that_was_asked_for_before_is_no_fall(build_env):
-    env = build_env("env.terminations.max_tilt=10", *STILL, *NOMINAL, num_envs=1)
+def test_a_lean_that_was_asked_for_before_is_no_fall(build_env, nominal):
+    env = build_env("env.terminations.max_tilt=10", *STILL, *nominal, num_envs=1)
     walk, pitch_down = (torch.tensor([env.skills.index(x)]) for x in ("walk", "pitch_down"))
     env.reset(walk, torch.zeros(1, 3))
     env.set_task(pitch_down, torch.zeros(1, 3))

@@ -54,6 +54,8 @@ def test_leaves_the_model_as_it_was(build, drill):
 def test_counts_lost_contacts(build, drill):
     spec = drill.robot.spec(visuals=False)
     spec.memory = 6000  # bytes: enough for a robot in the air
+    for joint in spec.joints:
+        joint.frictionloss = 0.0  # which takes more on the ground, where MuJoCo raises
     sim = build("native", model=spec.compile())
     drill.begin(sim, lift=[1.0, 1.0, 0.0, 0.0])
     sim.step(drill.hold)

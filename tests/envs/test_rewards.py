@@ -10,13 +10,14 @@ import torch
 
 from kiras_rl.config import ConfigError
 from kiras_rl.envs import rewards
-from kiras_rl.envs.rewards import RewardSum
-from kiras_rl.envs.state import Keyframes, RobotState, Step, Task
+from kiras_rl.envs.rewards import RewardSum, air_time, stance_time, swing_peak
+from kiras_rl.envs.state import Keyframes, Limits, RobotState, Step, Task
 from kiras_rl.schema import RewardConfig
 
 WALK, CRAWL = 0, 1
 KEYFRAMES = Keyframes(
     height=torch.tensor([0.2, 0.1]),
+    clearance=torch.tensor([0.06, 0.04]),
     pitch=torch.zeros(2),
     joint_pos=torch.tensor([[0.5, -1.0], [1.0, -2.0]]),
     gravity_b=torch.tensor([[0.0, 0.0, -1.0], [0.0, 0.0, -1.0]]),
@@ -41,6 +42,8 @@ def crafted(command=(0.5, 0.0, 0.2), fresh=False, fallen=False):
     robot.joint_vel = row(0.6, -0.4)
     robot.joint_torque = row(2.0, -1.0)
     robot.foot_contact = torch.tensor([[True, False]])
+    robot.foot_stands = robot.foot_contact
+    robot.peak_torque = row(2.0, 1.2)
     robot.foot_vel_w = torch.tensor([[[0.3, -0.4, 9.0], [5.0, 5.0, 5.0]]])
     robot.foot_force = row(60.0, 12.0)
     robot._foot_height = row(0.01, 0.08)
@@ -53,7 +56,15 @@ def crafted(command=(0.5, 0.0, 0.2), fresh=False, fallen=False):
         last_action=row(-2.0, 6.0),
         last_joint_vel=row(0.5, 0.0),
         last_joint_torque=row(1.0, 1.0),
-        air_time=row(0.18, 0.5),
+        stands=torch.tensor([math.hypot(*command) < 0.1]),
+        limits=Limits(
+            low=torch.tensor([-1.0, -1.5]),
+            high=torch.tensor([0.6, 2.0]),
+            velocity=torch.tensor([30.0, 30.0]),
+            torque=torch.tensor([2.0, 4.0]),
+        ),
+        target=row(0.4, -1.4),
+        memory={air_time: row(0.12, 0.5), stance_time: row(0.0, 0.1), swing_peak: row(0.03, 0.02)},
         fresh=torch.tensor([fresh]),
         fallen=torch.tensor([fallen]),
         dt=0.02,
@@ -80,13 +91,21 @@ EXPECTED = {
     "lin_vel_y": ({}, 0.01),
     "lin_vel_y_abs": ({}, 0.1),
     "foot_slip": ({}, 0.09 + 0.16),  # the second foot is in the air
-    "feet_air_time": ({"target": 0.1}, 0.08),  # the other foot is still in the air
+    "feet_air_time": ({"target": 0.1}, 0.02),  # the other foot is still in the air
+    "short_swing": ({"least": 0.16}, 0.04 / 0.16),
+    "short_stance": ({"least": 0.2}, 0.5),  # of the foot that lifts off now
+    "low_swing": ({"factor": 1.5}, (1 - 0.03 / 0.06) ** 2),  # crawl's clearance is 4 cm
+    "idle_feet": ({"most": 0.11}, 2.0),  # both have been in the air for longer
+    "flight": ({"feet": 2}, 1.0),
+    "joint_limits": ({"margin": 0.1}, (0.7 - 0.5) + (1.7 - 1.4)),  # the targets are just inside
+    "torque_limits": ({"share": 0.8}, 0.2),
     "feet_drag": ({}, -(0.3 + 0.4)),
     "foot_clearance": ({"height": 0.05}, 0.04 * 0.5),  # the other foot is high enough
     "feet_contact_forces": ({"threshold": 10.0, "largest": 20.0}, 20.0 + 2.0),
     "collision": ({"threshold": 0.1}, 1.0),
     "stand_still": ({}, 0.0),
     "stand_still_pose": ({}, 0.0),
+    "raised_feet": ({}, 0.0),
     "skill_height": ({"sigma": 0.05}, math.exp(-1.0)),  # 5 cm above crawl
     "skill_orientation": ({"sigma": 0.4}, math.exp(-(0.6**2 + 0.2**2) / 0.16)),
     "termination": ({}, 0.0),
@@ -103,6 +122,7 @@ def test_every_term_is_tested():
     terms = {
         name for name, f in inspect.getmembers(rewards, inspect.isfunction)
         if f.__module__ == rewards.__name__ and not name.startswith("_")
+        and f not in (air_time, stance_time, swing_peak)
     }  # fmt: skip
     assert terms == set(EXPECTED)
 
@@ -119,12 +139,32 @@ def test_sideways_errors_count_as_much_as_they_are_asked_to():
 def test_standing_still_is_asked_for_by_a_small_command(command, stands):
     step = crafted(command)
     assert value("stand_still", step) == pytest.approx(0.6 + 0.4 if stands else 0.0)
+    assert value("raised_feet", step) == (1.0 if stands else 0.0)
     # from the keyframe of the commanded skill: (1, -2)
     assert value("stand_still_pose", step) == pytest.approx(0.3 + 0.3 if stands else 0.0)
 
 
-def test_feet_of_a_robot_that_stands_are_left_alone():
-    assert value("feet_air_time", crafted((0.0, 0.0, 0.0)), target=0.1) == 0.0
+GAIT = ("feet_air_time", "short_swing", "short_stance", "low_swing", "idle_feet", "flight")
+
+
+@pytest.mark.parametrize("name", GAIT)
+def test_feet_of_a_robot_that_stands_are_left_alone(name):
+    parameters, _ = EXPECTED[name]
+    assert value(name, crafted((0.0, 0.0, 0.0)), **parameters) == 0.0
+
+
+def test_swings_and_stances_that_are_long_and_high_enough_cost_nothing():
+    step = crafted()
+    step.memory = {air_time: row(0.2, 0.5), stance_time: row(0, 0.3), swing_peak: row(0.09, 0)}
+    for name in ("short_swing", "short_stance", "low_swing"):
+        assert value(name, step, **EXPECTED[name][0]) == 0.0
+
+
+def test_targets_beyond_limits_cost_as_much_as_joints():
+    step = crafted()
+    step.target = row(0.7, -1.4)  # the first 0.1 rad above its limit of 0.6
+    inside = value("joint_limits", crafted(), margin=0.0)
+    assert value("joint_limits", step, margin=0.0) == pytest.approx(inside + 0.1)
 
 
 def test_the_first_step_has_no_change_of_torque():

@@ -9,10 +9,10 @@ import pytest
 import torch
 
 from kiras_rl.evaluation.flat import (
+    FLOOR,
     Recording,
     SkillResult,
     as_scalars,
-    lifts_per_second,
     moving_average,
     score,
     summarize,
@@ -24,10 +24,12 @@ KEYFRAMES = SimpleNamespace(
     skills=("low", "high"),
     keyframe_height=torch.tensor([0.2, 0.3]),
     keyframe_pitch=torch.tensor([0.0, 0.1]),
+    keyframe_clearance=torch.tensor([0.04, 0.08]),
 )
 PERFECT = SkillResult(
     height=0.2, pitch=0.0, velocity=0.3, height_error=0.0, pitch_error=0.0, velocity_error=0.0,
-    lifts=2.0, distinct=1.0, falls=0.0,
+    lifts=2.0, most_lifts=3.0, clearance=1.2, duty=0.5, beyond=0.0, saturated=0.0, power=5.0,
+    distinct=1.0, falls=0.0,
 )  # fmt: skip
 
 
@@ -41,7 +43,11 @@ def recording():
         height=KEYFRAMES.keyframe_height[skill].repeat(STEPS, 1),
         pitch=KEYFRAMES.keyframe_pitch[skill].repeat(STEPS, 1),
         velocity=torch.full((STEPS, 4), 0.3),
-        contact=(torch.arange(STEPS)[:, None, None] % 4 < 2).expand(STEPS, 4, 2).clone(),
+        stands=(torch.arange(STEPS)[:, None, None] % 4 < 2).expand(STEPS, 4, 2).clone(),
+        foot_height=torch.full((STEPS, 4, 2), 0.04),
+        beyond=torch.zeros(STEPS, 4, dtype=torch.bool),
+        saturated=torch.zeros(STEPS, 4),
+        power=torch.full((STEPS, 4), 7.0),
         alive=torch.ones(STEPS, 4, dtype=torch.bool),
         step_dt=DT,
     )
@@ -124,27 +130,30 @@ def test_a_robot_in_another_skill_s_keyframe_is_not_distinct(recording):
     assert (low.distinct, high.distinct) == (0.5, 1.0)
 
 
-def test_lifts_are_counted_by_foot():
-    contact = torch.ones(20, 1, 3, dtype=torch.bool)
-    contact[1::4, :, 0] = False  # 5 lifts in 2 s
-    contact[1::2, :, 1] = False
-    contact[5:9, :, 2] = False  # one lift
-    alive = torch.ones(20, 1, dtype=torch.bool)
-    assert lifts_per_second(contact, alive, DT).tolist() == [[2.5, 5.0, 0.5]]
-
-
-def test_a_fallen_robot_lifts_no_feet():
-    contact = torch.ones(20, 1, 1, dtype=torch.bool)
-    contact[1::4] = False  # steps 1 and 5, then after the fall 9, 13, 17
-    alive = (torch.arange(20) < 8)[:, None]
-    assert lifts_per_second(contact, alive, DT).item() == pytest.approx(2 / 0.8)
-    assert lifts_per_second(contact, alive & False, DT).tolist() == [[0.0]]
-
-
 def test_the_foot_that_lifts_least_counts(recording):
-    recording.contact[:, 2, 1] = True  # the others lift at steps 14, 18, 22 and 26 of 10 to 29
+    recording.stands[:, 2, 1] = True  # the others lift at steps 14, 18, 22 and 26 of 10 to 29
     low, high = summarize(recording, KEYFRAMES).values()
     assert (low.lifts, high.lifts) == pytest.approx((1.0, 2.0))
+    assert (low.most_lifts, high.most_lifts) == pytest.approx((2.0, 2.0))
+    assert (low.duty, high.duty) == pytest.approx((0.625, 0.5))
+
+
+def test_limits_and_power_are_shares_and_means_of_the_steps_that_count(recording):
+    recording.beyond[:15, 0] = True  # 5 of the 20 steps that count, of one of two robots
+    recording.saturated[20:, 1] = 0.5
+    recording.power[:, 3] = 9.0
+    low, high = summarize(recording, KEYFRAMES).values()
+    assert (low.beyond, high.beyond) == pytest.approx((0.125, 0.0))
+    assert (low.saturated, high.saturated) == pytest.approx((0.0, 0.125))
+    assert (low.power, high.power) == pytest.approx((7.0, 8.0))
+
+
+def test_steps_are_as_high_as_the_skill_asks(recording):
+    recording.foot_height[14:16, 0] = 0.06  # the second of five whole swings
+    recording.foot_height[12, 0] = 0.50  # when it lands
+    low, high = summarize(recording, KEYFRAMES).values()
+    assert high.clearance == pytest.approx(0.04 / 0.08)
+    assert low.clearance == pytest.approx((0.044 / 0.04 + 1.0) / 2)
 
 
 def test_the_average_looks_back_four_tenths_of_a_second():
@@ -159,17 +168,19 @@ def test_the_score_is_zero_when_perfect_and_one_at_a_limit():
     assert score({"a": at_limit, "b": PERFECT}) == pytest.approx(0.5)
     still = dataclasses.replace(PERFECT, lifts=0.0, velocity_error=0.12)
     assert score({"a": still}) == pytest.approx(2.0)
+    for worse in ({"clearance": 0.5}, {"most_lifts": 4.5}, {"beyond": 1.0}, {"saturated": 1.0}):
+        assert score({"a": dataclasses.replace(PERFECT, **worse)}) == pytest.approx(1.0)
 
 
 @pytest.mark.parametrize(
     "worse",
     [{"height_error": 0.04}, {"pitch_error": 0.1}, {"velocity_error": 0.2}, {"falls": 0.1},
-     {"lifts": 0.5}],
+     {"lifts": 0.5}, {"most_lifts": 5.0}, {"clearance": 0.4}, {"beyond": 0.02},
+     {"saturated": 0.06}],
 )  # fmt: skip
 def test_a_skill_is_learned_when_every_number_is_within_its_limit(worse):
-    limits = {"height": 0.03, "pitch": 0.087, "velocity": 0.12, "falls": 0.05}
-    assert PERFECT.meets(**limits)
-    assert not dataclasses.replace(PERFECT, **worse).meets(**limits)
+    assert PERFECT.meets(FLOOR)
+    assert not dataclasses.replace(PERFECT, **worse).meets(FLOOR)
 
 
 def test_results_are_logged_by_skill():

@@ -44,9 +44,10 @@ def motion():
         velocity=torch.full((STEPS, 4), 0.5),
         gravity_b=gravity_b.repeat(STEPS, 1, 1),
         joint_pos=ENV.keyframe_joint_pos[skill].repeat(STEPS, 1, 1),
-        joint_vel=torch.zeros(shape),
+        peak_torque=torch.zeros(shape),
         joint_torque=torch.zeros(shape),
-        contact=torch.ones(shape, dtype=torch.bool),
+        power=torch.zeros(STEPS, 4),
+        stands=torch.ones(shape, dtype=torch.bool),
         foot_height=torch.zeros(shape),
         alive=torch.ones(STEPS, 4, dtype=torch.bool),
         step_dt=DT,
@@ -69,7 +70,7 @@ def step_in_turn(motion, robot):
     """Let the first foot stand and swing for 0.2 s each, swing after swing 1 cm higher."""
     step = torch.arange(STEPS)
     swings = step % 20 >= 10  # from steps 10, 30, 50, 70, 90 and, not landing any more, 110
-    motion.contact[:, robot, 0] = ~swings
+    motion.stands[:, robot, 0] = ~swings
     motion.foot_height[:, robot, 0] = torch.where(step % 20 == 15, 0.01 * (1 + step // 20), 0.0)
 
 
@@ -149,18 +150,19 @@ def test_stepping_is_measured_on_every_foot(motion):
 
 def test_a_swing_that_began_before_does_not_count(motion):
     step_in_turn(motion, 0)
-    motion.contact[:4, 0, 1] = False
+    motion.stands[:4, 0, 1] = False
     motion.foot_height[:4, 0, 1] = 0.5
     assert next(iter(results(motion))).clearance == pytest.approx(0.03)
 
 
 def test_power_torque_and_cost_of_transport(motion):
     motion.joint_torque[:] = torch.tensor([1.0, -2.0])
-    motion.joint_vel[:] = torch.tensor([3.0, 4.0])
-    motion.joint_torque[7, 0, 1] = -2.4
-    motion.joint_vel[7, 0, 1] = 0.0
+    motion.peak_torque[:] = torch.tensor([1.0, 2.0])
+    motion.peak_torque[7, 0, 1] = 2.4
+    motion.power[:] = 11.0
+    motion.power[7, 0] = 3.0
     low, high = results(motion)
-    assert high.power == pytest.approx(11.0)  # 1 x 3 + 2 x 4
+    assert high.power == pytest.approx(11.0)
     assert high.torque == pytest.approx(1.5)
     assert (low.peak_torque, high.peak_torque) == pytest.approx((2.2, 2.0))
     assert high.cost_of_transport == pytest.approx(11.0 / (2.0 * 9.81 * 0.5))
@@ -172,9 +174,9 @@ def test_power_torque_and_cost_of_transport(motion):
 
 def test_a_robot_counts_until_it_falls(motion):
     step_in_turn(motion, 0)
-    motion.contact[:, 0, 1] = motion.contact[:, 0, 0]
+    motion.stands[:, 0, 1] = motion.stands[:, 0, 0]
     motion.foot_height[:, 0, 1] = motion.foot_height[:, 0, 0]
-    for signal in (motion.height, motion.velocity, motion.joint_torque, motion.joint_vel):
+    for signal in (motion.height, motion.velocity, motion.peak_torque, motion.power):
         signal[60:, 0] = 9.0
     motion.alive[60:, 0] = False
     low, high = results(motion)
@@ -230,7 +232,7 @@ def test_what_is_recorded_are_the_steps_after_the_first_second(env):
     }  # fmt: skip
     assert motion.skill.tolist() == [0, 1, 2, 3, 4]
     # Asked for the default pose the robots stand in it, on all feet: 2.178 kg at rest.
-    assert motion.alive.all() and motion.contact[50:].all()
+    assert motion.alive.all() and motion.stands[50:].all()
     assert motion.foot_height[50:].abs().max() < 0.01
     assert summarize(motion, env).skills["walk"].power < 0.2
     assert env.mass == pytest.approx(1.43315 + 4 * (0.14854 + 0.03764), abs=1e-4)

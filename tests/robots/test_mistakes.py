@@ -13,6 +13,12 @@ def test_unknown_robot():
         load_robot("solo9")
 
 
+def test_feet_ahead_go_with_knees(edit):
+    pose = {"base_height": 0.2, "pitch": 0, "joint_pos": [0.0] * 8, "feet_ahead": 0.1}
+    with pytest.raises(RobotError, match="feet_ahead goes with knees, not with joint_pos"):
+        edit("keyframes.yaml", pose=pose)
+
+
 def test_unknown_skill(solo8):
     with pytest.raises(RobotError, match=r"'wlak' \(did you mean 'walk'\?\); it has: walk, crawl"):
         solo8.keyframe("wlak")
@@ -113,18 +119,42 @@ def test_keyframe_that_is_too_heavy(edit):
     robot = edit("robot.yaml", torque_limit=0.5)
     with pytest.raises(
         RobotError,
-        match=r"keyframe 'walk' of solo8: H[LR]_KFE needs 0\.7[45] N m to hold it, "
+        match=r"keyframe 'walk' of solo8: [FH][LR]_KFE needs 0\.6[67] N m to hold it, "
         r"0\.40 N m at most \(20% below its limit\): change the pose in .*keyframes\.yaml",
     ):
         check_keyframe(robot, robot.keyframe("walk"))
 
 
 def test_keyframe_that_leaves_steps_no_room(edit):
-    low = {"base_height": 0.08, "pitch": 0, "knees": "back"}
-    margin = 2.80 - 2.0 * float(np.arccos(0.064 / 0.32))
+    low = {"base_height": 0.085, "pitch": 0, "knees": "back"}
+    margin = 2.80 - 2.0 * float(np.arccos(0.069 / 0.32))
     robot = edit("keyframes.yaml", low=low)
     with pytest.raises(RobotError, match=rf"_KFE is {margin:.3f} rad from its limit, 0\.1 rad"):
         check_keyframe(robot, robot.keyframe("low"))
+
+
+def test_keyframe_that_kneels(edit):
+    # thighs at 0.945 rad put the knees 0.1 - 0.16 cos 0.945 = 0.006 m high, of 0.018 m radius
+    outside = {"F*": 0.03, "H*": -0.03}
+    crawl = {"base_height": 0.1, "pitch": 0, "knees": "inward", "feet_ahead": outside}
+    robot = edit("keyframes.yaml", crawl=crawl)
+    with pytest.raises(
+        RobotError, match=r"_thigh is -0\.012 m above the ground, 0\.005 m at least"
+    ):
+        check_keyframe(robot, robot.keyframe("crawl"))
+
+
+def test_keyframe_whose_feet_are_ahead(edit):
+    walk = {
+        "base_height": 0.2,
+        "pitch": 0,
+        "knees": "back",
+        "feet_ahead": {"FL*": 0.05, "*R_*": 0.0, "HL*": 0.0},
+    }
+    robot = edit("keyframes.yaml", walk=walk)
+    hip = float(np.arccos(np.hypot(0.184, 0.05) / 0.32) - np.arctan(0.05 / 0.184))
+    assert robot.keyframe("walk").joint_pos[0] == pytest.approx(hip, abs=1e-6)
+    assert robot.keyframe("walk").joint_pos[2] == pytest.approx(np.arccos(0.184 / 0.32), abs=1e-6)
 
 
 def test_unknown_variant(solo8):

@@ -131,8 +131,13 @@ def test_a_result_holds_for_the_physics_that_it_was_measured_on(tmp_path, monkey
     assert standard == key(2) == key(3, backend="native")
     assert standard not in (key(4, backend="warp"), key(5, nominal=True))
     slippery = load_config("solo8", ["env.randomization.friction=[0.1,0.2]"])
-    monkeypatch.setattr("kiras_rl.tools.evaluator.standard_config", lambda robot: slippery)
-    assert key(6) != standard
+    with monkeypatch.context() as patch:
+        patch.setattr("kiras_rl.tools.evaluator.standard_config", lambda robot: slippery)
+        assert key(6) != standard
+    robot = load_robot("solo8")
+    weak = replace(robot, motor=replace(robot.motor, stall_torque=robot.motor.stall_torque / 2))
+    monkeypatch.setattr("kiras_rl.tools.policy_files.load_robot", lambda name: weak)
+    assert key(7) != standard
 
 
 def test_what_counts_as_a_fall_is_the_robot_s_standard():

@@ -28,13 +28,13 @@ class Protocol(NamedTuple):
 PROTOCOLS = {
     "obstacles": Protocol(["--trials", "1"], results=3, stop=75),
     "heat_map": Protocol(["--trials", "1", "--robots", "1"], results=9, stop=125),
-    "robustness": Protocol(["--robots", "1"], results=15, stop=100),
+    "robustness": Protocol(["--robots", "1"], results=26, stop=100),
 }
 
 
 @pytest.fixture(scope="module")
 def short():
-    """Let ways and times be short: 0.35 m within 1 s on terrain, 1.1 s of three values each."""
+    """Let ways and times be short: 0.35 m within 1 s on terrain, 1.1 s of two values each."""
     sweeps = robustness.sweeps
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("kiras_rl.evaluation.terrain.RADIUS", 0.35)
@@ -43,7 +43,9 @@ def short():
         patch.setattr(
             robustness,
             "sweeps",
-            lambda config: [replace(s, values=s.values[::3]) for s in sweeps(config)],
+            lambda config: [
+                replace(s, values=s.values[:: len(s.values) - 1]) for s in sweeps(config)
+            ],
         )
         yield
 
@@ -136,11 +138,19 @@ def check_heat_map(folder):
 
 def check_robustness(folder):
     values = {
-        "push": ["0", "0.4", "1"],
-        "payload": ["-0.5", "0.5", "1.5"],
-        "friction": ["1.25", "0.2", "0.02"],
-        "delay": ["0", "20", "40"],
-        "torque_limit": ["1.2", "0.6", "0.3"],
+        "push": ["0", "1.5"],
+        "payload": ["-0.5", "1.5"],
+        "leg_mass": ["0.7", "1.5"],
+        "friction": ["1.25", "0.02"],
+        "action_delay": ["0", "40"],
+        "observation_delay": ["0", "20"],
+        "torque_limit": ["1.2", "0.5"],
+        "motor_strength": ["0", "0.4"],
+        "joint_friction": ["0", "8"],
+        "joint_damping": ["0", "100"],
+        "encoder_bias": ["0", "0.1"],
+        "imu_tilt": ["0", "0.1"],
+        "gyro_bias": ["0", "0.5"],
     }
     for name, rows in values.items():
         table = read(folder, f"robustness_{name}")

@@ -19,9 +19,11 @@ from kiras_rl.tools.protocols import (
     heat_map,
     imitation,
     learning,
+    limits,
     obstacles,
     robustness,
     sampling,
+    sim2sim,
     terrain,
     transitions,
 )
@@ -30,11 +32,13 @@ from kiras_rl.tools.protocols.subject import Subject
 PROTOCOLS: dict[str, ModuleType] = {
     "flat": flat,
     "imitation": imitation,
+    "limits": limits,
     "transitions": transitions,
     "terrain": terrain,
     "heat_map": heat_map,
     "obstacles": obstacles,
     "robustness": robustness,
+    "sim2sim": sim2sim,
     "sampling": sampling,
     "learning": learning,
 }

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import asdict
 
-from kiras_rl.evaluation.flat import FLOOR, SkillResult, evaluate_skills
+from kiras_rl.evaluation.flat import FLOOR, TARGET, Goal, SkillResult, evaluate_skills
 from kiras_rl.tools.protocols.rows import skill_table
 from kiras_rl.tools.protocols.subject import Subject
 from kiras_rl.tools.report.content import Cell, Column, Section, Table
+
+GOALS = {"target": TARGET, "floor": FLOOR}
+"""What a table calls reached, the best first."""
 
 TITLE = "Flat ground"
 TEXT = (
@@ -18,19 +22,24 @@ TEXT = (
     "step."
 )
 
-TARGET = {"height": 0.01, "pitch": math.radians(2.0), "velocity": 0.08, "falls": 0.0}
-"""What a skill should reach: m, rad, m/s, share of robots."""
-
-COLUMNS = (
+POSTURE = (
     Column("height", "cm", "{:.1f}"),
     Column("error", "cm", "{:.1f}", best="low"),
     Column("pitch", "deg", "{:+.1f}"),
     Column("error", "deg", "{:.1f}", best="low"),
     Column("v_x", "m/s", "{:+.2f}"),
     Column("error", "m/s", "{:.2f}", best="low"),
-    Column("lifts", "1/s", "{:.1f}"),
     Column("falls", "%", "{:.0f}", best="low"),
     Column("reached"),
+)
+GAIT = (
+    Column("lifts", "1/s, least", "{:.1f}"),
+    Column("lifts", "1/s, most", "{:.1f}"),
+    Column("clearance", "% of its own", "{:.0f}"),
+    Column("duty", "%", "{:.0f}"),
+    Column("beyond joint limits", "%", "{:.1f}", best="low"),
+    Column("motor at its limit", "%", "{:.1f}", best="low"),
+    Column("power", "W", "{:.1f}", best="low"),
 )
 
 
@@ -51,19 +60,23 @@ def measure(subject: Subject) -> dict:
 
 
 def section(results: dict[str, dict]) -> Section:
-    """Return the table of one or several policies."""
-    return Section("flat", TITLE, TEXT, [table({k: v["skills"] for k, v in results.items()})])
+    """Return the tables of one or several policies."""
+    return Section("flat", TITLE, TEXT, tables({k: v["skills"] for k, v in results.items()}))
 
 
-def table(results: dict[str, dict[str, dict]], title: str = "Skills on flat ground") -> Table:
-    """Return a row a skill, from label -> skill -> fields of SkillResult."""
-    return skill_table(title, COLUMNS, results, _cells, _limits())
+def tables(
+    results: dict[str, dict[str, dict]], title: str = "Skills on flat ground"
+) -> list[Table]:
+    """Return posture and gait, a row a skill, from label -> skill -> fields of SkillResult."""
+    return [
+        skill_table(title, POSTURE, results, _posture, _goals(_posture_words)),
+        skill_table("Gait and limits", GAIT, results, _gait, _goals(_gait_words)),
+    ]
 
 
-def _cells(values: dict) -> tuple[Cell, ...]:
+def _posture(values: dict) -> tuple[Cell, ...]:
     result = SkillResult(**values)
-    limits = {"target": TARGET, "floor": FLOOR}
-    reached = next((name for name in limits if result.meets(**limits[name])), "neither")
+    reached = next((name for name, goal in GOALS.items() if result.meets(goal)), "neither")
     return (
         100 * result.height,
         100 * result.height_error,
@@ -71,20 +84,38 @@ def _cells(values: dict) -> tuple[Cell, ...]:
         math.degrees(result.pitch_error),
         result.velocity,
         result.velocity_error,
-        result.lifts,
         100 * result.falls,
         reached,
     )
 
 
-def _limits() -> str:
-    def words(limits: dict[str, float]) -> str:
-        return (
-            f"{100 * limits['height']:.0f} cm, {math.degrees(limits['pitch']):.0f} degrees, "
-            f"{limits['velocity']:.2f} m/s, {100 * limits['falls']:.0f} % falls"
-        )
-
+def _gait(values: dict) -> tuple[Cell, ...]:
+    result = SkillResult(**values)
     return (
-        f"Floor: errors of at most {words(FLOOR)}, and every foot lifts once a second; "
-        f"target: {words(TARGET)}."
+        result.lifts,
+        result.most_lifts,
+        100 * result.clearance,
+        100 * result.duty,
+        100 * result.beyond,
+        100 * result.saturated,
+        result.power,
+    )
+
+
+def _goals(words: Callable[[Goal], str]) -> str:
+    return f"Floor: {words(FLOOR)}; target: {words(TARGET)}. Both take both tables."
+
+
+def _posture_words(goal: Goal) -> str:
+    return (
+        f"errors of at most {100 * goal.height:.0f} cm, {math.degrees(goal.pitch):.0f} degrees, "
+        f"{goal.velocity:.2f} m/s, {100 * goal.falls:.0f} % falls"
+    )
+
+
+def _gait_words(goal: Goal) -> str:
+    return (
+        f"{goal.lifts[0]:g} to {goal.lifts[1]:g} lifts per second, a clearance of "
+        f"{100 * goal.clearance:.0f} % at least, {100 * goal.beyond:g} % beyond joint limits and "
+        f"{100 * goal.saturated:g} % at a motor's limit at most"
     )

@@ -25,7 +25,7 @@ TEXT = (
     "cosine to the keyframe on flat ground (C) beside them. Headline: steps of 6 cm, gaps of 8 cm "
     "(times the scale of the robot's terrain). Kept: crossed in the skill's own keyframe, with "
     "mean errors of height and pitch over the ground it stands on of at most "
-    f"{100 * FLOOR['height']:.0f} cm and {math.degrees(FLOOR['pitch']):.0f} degrees."
+    f"{100 * FLOOR.height:.0f} cm and {math.degrees(FLOOR.pitch):.0f} degrees."
 )
 
 HEADLINE = {"S": Obstacle("stairs", 4), "D": Obstacle("footholds", 5)}
@@ -71,7 +71,7 @@ def _parts(
             level=obstacle.level,
             part=index,
             trials=number,
-            kept=f"{100 * FLOOR['height']:g}cm,{math.degrees(FLOOR['pitch']):g}deg",
+            kept=f"{100 * FLOOR.height:g}cm,{math.degrees(FLOOR.pitch):g}deg",
         )
         yield key, partial(run, number, index)
 

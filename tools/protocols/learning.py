@@ -70,7 +70,7 @@ def measure(subject: Subject) -> dict:
             {
                 "steps": steps,
                 "minutes": minutes,
-                "at_floor": [sum(r.meets(**FLOOR) for r in skills) for skills in results],
+                "at_floor": [sum(r.meets(FLOOR) for r in skills) for skills in results],
                 "height_error": [100 * _mean(skills, "height_error") for skills in results],
                 "velocity_error": [_mean(skills, "velocity_error") for skills in results],
             }

@@ -17,10 +17,13 @@ TITLE = "Robustness"
 TEXT = (
     "Every skill walks straight ahead for 10 s on flat ground while one disturbance is set to a "
     "value and all others are drawn as in training. Pushes come about every 5 s, each axis up to "
-    "the value. A robot succeeds if it does not fall and its "
-    f"errors stay at the floor's: {100 * FLOOR['height']:.0f} cm, "
-    f"{math.degrees(FLOOR['pitch']):.0f} degrees, {FLOOR['velocity']:.2f} m/s."
+    "the value; biases, tilts and motors' strengths are drawn from minus to plus the value for "
+    "each joint or axis. A robot succeeds if it does not fall and its "
+    f"errors stay at the floor's: {100 * FLOOR.height:.0f} cm, "
+    f"{math.degrees(FLOOR.pitch):.0f} degrees, {FLOOR.velocity:.2f} m/s."
 )
+
+Setter = Callable[[RandomizationConfig, float], None]
 
 DURATION = 10.0  # s
 # At a friction of 0.1 and less the few of training leave contacts unsolved: worlds diverge, and
@@ -44,56 +47,58 @@ class Sweep:
     unit: str
     values: tuple[float, ...]
     trained: tuple[float, float]
-    apply: Callable[[RandomizationConfig, float], None]
+    apply: Setter
 
 
 def sweeps(config: Config) -> list[Sweep]:
     """Return the sweeps; sizes follow the robot's own randomization."""
     drawn, step = config.env.randomization, 1000.0 * config.sim.timestep
-    push, payload = drawn.push_velocity[1], drawn.payload[1]
 
-    def set_push(r: RandomizationConfig, value: float) -> None:
-        r.push_velocity = (-value, value)
+    def trained(name: str, scale: float = 1.0) -> tuple[float, float]:
+        nominal = 1.0 if name.endswith("factor") else 0.0
+        low, high = getattr(drawn, name) or (nominal, nominal)
+        return scale * low, scale * high
 
-    def set_delay(r: RandomizationConfig, value: float) -> None:
-        r.action_delay = (round(value / step), round(value / step))
+    def spread(name: str) -> tuple[float, float]:
+        low, high = trained(name)
+        return 0.0, (high - low) / 2
 
-    def setter(name: str) -> Callable[[RandomizationConfig, float], None]:
-        return lambda r, value: setattr(r, name, (value, value))
+    def fixed(name: str, scale: float = 1.0, unit: type = float) -> Setter:
+        return lambda r, value: setattr(r, name, (unit(value / scale), unit(value / scale)))
 
+    def around(name: str, centre: float = 0.0) -> Setter:
+        return lambda r, value: setattr(r, name, (centre - value, centre + value))
+
+    payload = trained("payload")[1] or 0.25
+    delays = tuple(step * k for k in (0, 2, 3, 4, 5, 6, 8))
     return [
-        Sweep(
-            "push", "m/s", tuple(push * k for k in (0, 1, 2, 4, 6, 8, 10)), (0.0, push), set_push
-        ),
-        Sweep(
-            "payload",
-            "kg",
-            tuple(payload * k for k in (-2, 0, 1, 2, 3, 4, 6)),
-            drawn.payload,
-            setter("payload"),
-        ),
-        Sweep(
-            "friction",
-            "",
-            (1.25, 0.8, 0.5, 0.2, 0.1, 0.05, 0.02),
-            drawn.friction,
-            setter("friction"),
-        ),
-        Sweep(
-            "delay",
-            "ms",
-            tuple(step * k for k in (0, 2, 3, 4, 5, 6, 8)),
-            tuple(step * k for k in drawn.action_delay),
-            set_delay,
-        ),
-        Sweep(
-            "torque limit",
-            "of the motor's",
-            (1.2, 1.0, 0.8, 0.6, 0.5, 0.4, 0.3),
-            drawn.torque_factor or (1.0, 1.0),
-            setter("torque_factor"),
-        ),
-    ]
+        Sweep("push", "m/s", (0.0, 0.1, 0.3, 0.5, 0.7, 1.0, 1.5),
+              spread("push_velocity"), around("push_velocity")),
+        Sweep("payload", "kg", tuple(payload * k for k in (-2, 0, 1, 2, 3, 4, 6)),
+              trained("payload"), fixed("payload")),
+        Sweep("leg mass", "of the nominal", (0.7, 0.9, 1.0, 1.1, 1.3, 1.5),
+              trained("leg_mass_factor"), fixed("leg_mass_factor")),
+        Sweep("friction", "", (1.25, 0.8, 0.5, 0.2, 0.1, 0.05, 0.02), trained("friction"),
+              fixed("friction")),
+        Sweep("action delay", "ms", delays, trained("action_delay", step),
+              fixed("action_delay", step, round)),
+        Sweep("observation delay", "ms", tuple(step * k for k in range(5)),
+              trained("observation_delay", step), fixed("observation_delay", step, round)),
+        Sweep("torque limit", "of the motor's", (1.2, 1.0, 0.9, 0.8, 0.7, 0.6, 0.5),
+              trained("torque_factor"), fixed("torque_factor")),
+        Sweep("motor strength", "+-", (0.0, 0.1, 0.2, 0.3, 0.4), spread("motor_factor"),
+              around("motor_factor", 1.0)),
+        Sweep("joint friction", "of the nominal", (0.0, 1.0, 2.0, 3.0, 5.0, 8.0),
+              trained("joint_friction_factor"), fixed("joint_friction_factor")),
+        Sweep("joint damping", "of the nominal", (0.0, 1.0, 2.0, 10.0, 100.0),
+              trained("joint_damping_factor"), fixed("joint_damping_factor")),
+        Sweep("encoder bias", "+- rad", (0.0, 0.02, 0.04, 0.06, 0.08, 0.1),
+              spread("encoder_bias"), around("encoder_bias")),
+        Sweep("IMU tilt", "+- rad", (0.0, 0.02, 0.04, 0.06, 0.1), spread("imu_tilt"),
+              around("imu_tilt")),
+        Sweep("gyro bias", "+- rad/s", (0.0, 0.05, 0.1, 0.2, 0.5), spread("gyro_bias"),
+              around("gyro_bias")),
+    ]  # fmt: skip
 
 
 def measure(subject: Subject) -> dict:
@@ -112,7 +117,7 @@ def measure(subject: Subject) -> dict:
         stands = robots["falls"] == 0
         keeps = stands.clone()
         for name in ("height", "pitch", "velocity"):
-            keeps &= robots[f"{name}_error"] <= FLOOR[name]
+            keeps &= robots[f"{name}_error"] <= getattr(FLOOR, name)
         return {
             skill: {
                 "success": keeps[recording.skill == i].float().mean().item(),

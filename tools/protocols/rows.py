@@ -9,6 +9,7 @@ from matplotlib.figure import Figure as Drawing
 
 from kiras_rl.tools.report.content import Cell, Column, Table
 
+ABREAST = 7  # panels in a row
 PALETTE = ("#1f5fa8", "#d1662a", "#2f8f57", "#8a4fb0", "#b3364a", "#6b7280", "#0f8b8d", "#a67c00")
 
 
@@ -48,13 +49,17 @@ def scaled(value: float | None, factor: float) -> float | None:
 def panels(
     count: int, width: float = 3.4, height: float = 2.8, share: bool = True
 ) -> tuple[Drawing, list[Axes]]:
-    """Return a drawing with `count` axes in one row, which share their y axis if asked to."""
-    drawing = Drawing(figsize=(width * count, height), layout="constrained")
-    axes = drawing.subplots(1, count, sharey=share, squeeze=False)
-    for axis in axes[0]:
+    """Return a drawing with `count` axes in rows of ABREAST, which share y axes if asked to."""
+    columns = min(count, ABREAST)
+    rows = -(-count // ABREAST)
+    drawing = Drawing(figsize=(width * columns, height * rows), layout="constrained")
+    axes = drawing.subplots(rows, columns, sharey=share, squeeze=False).ravel()
+    for axis in axes[count:]:
+        axis.remove()
+    for axis in axes[:count]:
         axis.grid(alpha=0.3)
         axis.spines[["top", "right"]].set_visible(False)
-    return drawing, list(axes[0])
+    return drawing, list(axes[:count])
 
 
 def colours() -> Iterator[str]:

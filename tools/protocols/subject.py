@@ -215,9 +215,10 @@ class Subject:
         """A short name of robot, simulation and environment: other ones give other results."""
         contract = self.onboard.metadata.to_dict() | {"provenance": None, "version": None}
         mjcf = self.robot.mjcf.read_text(encoding="utf-8")
+        motor = [values.tolist() for values in vars(self.robot.motor).values()]
         machine = {"backend": None, "threads": None}  # the first one is in the key by itself
         grounds = [(asdict(c.sim) | machine, asdict(c.env)) for c in (self.flat(), self.rough())]
-        text = json.dumps([contract, mjcf, *grounds], sort_keys=True)
+        text = json.dumps([contract, mjcf, motor, *grounds], sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()[:8]
 
 
