@@ -106,7 +106,7 @@ LIMITS = {
     "env.terrain.seed": Limits(0, _SEED),
     "env.terrain.cell": Limits(0, 1, above=True),
     "env.terrain.noise": Limits(0, 1),
-    "learner.ppo.num_steps": Limits(0, 100_000, above=True),
+    "learner.ppo.num_steps": Limits(2, 100_000),
     "learner.ppo.num_epochs": Limits(0, 1000, above=True),
     "learner.ppo.num_mini_batches": _COUNTED,
     "learner.ppo.gamma": _SHARE,

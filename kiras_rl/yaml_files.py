@@ -66,8 +66,8 @@ def read_yaml_text(text: str) -> Any:
     Raises:
         YamlError: No usable YAML, or a key that stands twice.
     """
-    loader = _Loader(text)
     try:
+        loader = _Loader(text)
         node = loader.get_single_node()
         return None if node is None else _plain(loader, node, 0)
     except yaml.YAMLError as error:
@@ -78,8 +78,6 @@ def read_yaml_text(text: str) -> Any:
         if isinstance(error, YamlError):
             raise
         raise YamlError(" ".join(str(error).split())) from None
-    finally:
-        loader.dispose()
 
 
 def _plain(loader: _Loader, node: Node, depth: int) -> Any:

@@ -13,6 +13,7 @@ from kiras_rl.robots.keyframes import Keyframe, KeyframeReader
 from kiras_rl.robots.reading import (
     RobotError,
     check_keys,
+    check_name,
     frozen,
     hint,
     matching,
@@ -185,6 +186,7 @@ def load_robot(name: str, root: Path = ROBOTS) -> Robot:
         )
     folder = root / base
     where = str(folder / "robot.yaml")
+    check_name(base, "robot", str(folder))
     entries = _with_variant(read_yaml(folder / "robot.yaml"), name, variant, where)
     check_keys(entries, _KEYS + _OPTIONAL_KEYS, required=_KEYS, where=where)
     model = load_mjcf(_mjcf(folder))

@@ -224,6 +224,7 @@ def test_the_page_on_configuration_shows_every_range():
         "env.observations.proprio.joint_pos.noise=-1",
         "finetuning.env.terrain.types.stairs.proportion=-1",
         "learner.ppo.gamma=1.5",
+        "learner.ppo.num_steps=1",
         "env.skills.switch_probability=7",
         "env.terminations.max_tilt=400",
         "learner.ppo.action_std=[[0,0.5],[1,1000]]",

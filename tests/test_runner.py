@@ -6,6 +6,7 @@ import itertools
 import math
 import signal
 import threading
+from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
@@ -233,6 +234,21 @@ def test_an_update_that_leaves_no_numbers_ends_the_run(make_runner):
     with pytest.raises(TrainingError, match=r"iteration 2: .*not finite"):
         runner.learn()
     assert latest(runner).read_bytes() == before
+
+
+def test_a_run_goes_on_with_its_own_robot(make_runner):
+    runner = make_runner("robot")
+    runner.save_latest()
+    other = make_runner("robot")
+    robot = other.env.robot_cfg
+    other.env.robot_cfg = replace(robot, kp=2 * robot.kp)
+    with pytest.raises(CheckpointError) as caught:
+        other.load(str(latest(runner)))
+    message = str(caught.value)
+    assert f"kp (number 0) was {robot.kp[0]} and is {2 * robot.kp[0]}" in message
+    assert "--changed-robot" in message and "\n" not in message
+    other.takes_changed_robot = True
+    other.load(str(latest(runner)))
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

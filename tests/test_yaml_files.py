@@ -34,6 +34,7 @@ def test_names_and_numbers(text, value):
         ("[" * 9999, "nested too deeply"),
         ("? [1]\n: 2", "a key must be a name"),
         ("a: {", "line 1"),
+        ("a: \x0b", "special characters are not allowed"),
         ("--- 1\n--- 2", "a single document"),
         ("a: !!python/object:os.system x", "could not determine a constructor"),
         ("a: 1" + 400 * "0", "too large for a whole number"),

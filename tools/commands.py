@@ -7,54 +7,54 @@ from importlib import import_module
 from kiras_rl.tools.ending import finish
 
 
-def bench() -> int:
-    """Run kiras-bench."""
-    return _run("bench")
+def bench(argv: list[str] | None = None) -> int:
+    """Run kiras-bench; return its exit status."""
+    return _run("bench", argv)
 
 
-def collect() -> int:
-    """Run kiras-collect."""
-    return _run("collect")
+def collect(argv: list[str] | None = None) -> int:
+    """Run kiras-collect; return its exit status."""
+    return _run("collect", argv)
 
 
-def compare() -> int:
-    """Run kiras-compare."""
-    return _run("compare")
+def compare(argv: list[str] | None = None) -> int:
+    """Run kiras-compare; return its exit status."""
+    return _run("compare", argv)
 
 
-def evaluate() -> int:
-    """Run kiras-evaluate."""
-    return _run("evaluate")
+def evaluate(argv: list[str] | None = None) -> int:
+    """Run kiras-evaluate; return its exit status."""
+    return _run("evaluate", argv)
 
 
-def export() -> int:
-    """Run kiras-export."""
-    return _run("export")
+def export(argv: list[str] | None = None) -> int:
+    """Run kiras-export; return its exit status."""
+    return _run("export", argv)
 
 
-def keyframes() -> int:
-    """Run kiras-keyframes."""
-    return _run("keyframes")
+def keyframes(argv: list[str] | None = None) -> int:
+    """Run kiras-keyframes; return its exit status."""
+    return _run("keyframes", argv)
 
 
-def play() -> int:
-    """Run kiras-play."""
-    return _run("play")
+def play(argv: list[str] | None = None) -> int:
+    """Run kiras-play; return its exit status."""
+    return _run("play", argv)
 
 
-def terrains() -> int:
-    """Run kiras-terrains."""
-    return _run("terrains")
+def terrains(argv: list[str] | None = None) -> int:
+    """Run kiras-terrains; return its exit status."""
+    return _run("terrains", argv)
 
 
-def train() -> int:
-    """Run kiras-train."""
-    return _run("train")
+def train(argv: list[str] | None = None) -> int:
+    """Run kiras-train; return its exit status."""
+    return _run("train", argv)
 
 
-def _run(name: str) -> int:
+def _run(name: str, argv: list[str] | None) -> int:
     def work() -> int:
         import_module("kiras_rl.robots")  # MuJoCo first, whatever graphics there are
-        return import_module(f"kiras_rl.tools.{name}").main()
+        return import_module(f"kiras_rl.tools.{name}").main(argv)
 
     return finish(work)

@@ -122,6 +122,11 @@ def test_names_that_commands_cannot_carry_are_refused(edit_text, name):
     assert f"keyframe {name!r}: a name has letters, digits" in message
 
 
+def test_a_robot_s_own_name_is_one_that_commands_can_carry(edit_text):
+    with pytest.raises(RobotError, match="robot 'my robot': a name has letters"):
+        edit_text("robot.yaml", lambda text: text, name="my robot")
+
+
 def test_another_encoding_is_refused(edit_text):
     message = refusal(edit_text, "robot.yaml", lambda text: ("# ü\n" + text).encode("latin-1"))
     assert "line 1 is not UTF-8" in message

@@ -191,7 +191,7 @@ def test_jobs_divide_the_cores_of_this_process(monkeypatch):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGHUP, signal.SIGINT, signal.SIGTERM])
 def test_stopped_jobs_save(number, tmp_path):
     jobs = str(min(2, len(os.sched_getaffinity(0))))
     overrides = ["num_envs=4", "iterations=100000", "finetuning=null", "evaluation.interval=0"]
