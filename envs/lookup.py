@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import difflib
 import inspect
-from collections.abc import Callable, Iterable
-
-import torch
+from collections.abc import Callable
 
 from kiras_rl.config import ConfigError
 
@@ -35,34 +33,3 @@ def _is_term(function: Callable, first: type) -> bool:
     parameters = list(inspect.signature(function).parameters.values())
     is_public = not function.__name__.startswith("_")
     return is_public and bool(parameters) and parameters[0].annotation == first.__name__
-
-
-def evaluate(
-    function: Callable, argument: object, where: str, shape: tuple[int | None, ...]
-) -> torch.Tensor:
-    """Return what a term gives, as float32.
-
-    Args:
-        function: The term.
-        argument: What it looks at.
-        where: Its key in the YAML, for the message.
-        shape: What it has to have; None for any number.
-
-    Raises:
-        ConfigError: Something else than a tensor of this shape.
-    """
-    value = function(argument)
-    if isinstance(value, torch.Tensor) and _fits(tuple(value.shape), shape):
-        return value.float()
-    given = f"shape {_text(value.shape)}" if isinstance(value, torch.Tensor) else repr(value)
-    raise ConfigError(f"{where}: the term returns {given}, it has to be of shape {_text(shape)}")
-
-
-def _fits(given: tuple[int, ...], wanted: tuple[int | None, ...]) -> bool:
-    return len(given) == len(wanted) and all(
-        b is None or a == b for a, b in zip(given, wanted, strict=True)
-    )
-
-
-def _text(shape: Iterable[int | None]) -> str:
-    return f"({', '.join('k' if n is None else str(n) for n in shape)})"

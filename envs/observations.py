@@ -11,8 +11,9 @@ from dataclasses import dataclass
 import torch
 
 from kiras_rl.config import ConfigError
-from kiras_rl.envs.lookup import evaluate, find_function
+from kiras_rl.envs.lookup import find_function
 from kiras_rl.envs.sensing import Sensed
+from kiras_rl.envs.shapes import evaluate
 from kiras_rl.envs.state import Keyframes, RobotState, Task
 
 SCAN_LIMIT = 1.0  # m

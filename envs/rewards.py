@@ -15,8 +15,9 @@ from functools import partial
 import torch
 
 from kiras_rl.config import ConfigError
-from kiras_rl.envs.lookup import evaluate, find_function
+from kiras_rl.envs.lookup import find_function
 from kiras_rl.envs.memory import remembering
+from kiras_rl.envs.shapes import evaluate
 from kiras_rl.envs.state import Step
 from kiras_rl.schema import RewardConfig
 

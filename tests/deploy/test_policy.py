@@ -107,7 +107,7 @@ def test_the_target_is_default_plus_scaled_action(policy):
 
 def test_targets_are_clipped_to_the_joint_limits(make_metadata, make_policy, tmp_path):
     metadata = make_metadata(joint_limits=[[-0.9, 0.85], [-1.7, 1.7]] * 4)
-    networks = make_policy(metadata, gain=100.0)  # actions far beyond
+    networks = make_policy(metadata, gain=10.0)  # actions far beyond
     export_policy(networks, metadata, tmp_path / "a.onnx")
     target = step(OnboardPolicy(tmp_path / "a.onnx"))
     low, high = np.array(metadata.joint_limits).T
