@@ -114,7 +114,7 @@ class Sensors:
     def _motion(self, robot: RobotState, begun: torch.Tensor) -> tuple[torch.Tensor, ...]:
         """Return quaternion, rates, joint angles and velocities as old as each world's sensors."""
         now = (robot.base_quat_w, robot.base_ang_vel_b, robot.joint_pos, robot.joint_vel)
-        if not self._config.observation_delay:
+        if self._layout.motion is None:  # nothing is late
             return now
         record = self._sim.sensor_record  # its last row is a physics step older than now
         steps = record.shape[1]

@@ -45,6 +45,10 @@ ROUGH = (
 )
 
 
+POSTURE = (0.2, 0.0, 0.3)  # height, pitch, velocity
+GAIT = (2.0, 3.0, 1.0, 0.6, 0.0, 0.0, 5.0, 1.0, 0.0)  # from lifts on, all good
+
+
 @pytest.fixture
 def make_runner(tmp_path):
     """Return a function that builds a run from its configuration: what a new process does."""
@@ -63,7 +67,7 @@ def tell():
     """Return a function that sums up a run's evaluations as a constant result."""
     from kiras_rl.evaluation.flat import SkillResult
 
-    return lambda error: {"walk": SkillResult(0.2, 0.0, 0.3, error, 0.0, 0.0, 2.0, 1.0, 0.0)}
+    return lambda error: {"walk": SkillResult(*POSTURE, error, 0.0, 0.0, *GAIT)}
 
 
 def latest(runner):

@@ -46,10 +46,11 @@ def test_a_picture_that_cannot_be_written_is_refused(command, opengl, tmp_path, 
 def test_table_says_what_each_keyframe_asks(no_opengl, capsys):
     assert keyframes.main(["solo8"]) == 0
     rows = [" ".join(line.split()) for line in capsys.readouterr().out.splitlines()]
-    # height, pitch, hip and knee, 0.32 - 0.284 m of reach, 0.40 of 2.5 N m, feet on the ground
-    assert "stilt 0.30 0 all 0.48 -0.96 36 0.40 (16%) 0.0" in rows
-    assert "pitch_up 0.20 -15 FL FR 1.02 -1.51 87 0.83 (33%) 0.0" in rows
-    assert "HL HR 1.40 -2.27" in rows
+    # height, pitch, hip and knee, 0.32 - 0.284 m of reach, 1.45 - 0.48 rad to the hip's limit,
+    # 0.38 of 1.8 N m, feet on the ground
+    assert "stilt 0.30 0 FL FR 0.48 -0.96 36 0.97 0.38 (21%) 0.0" in rows
+    assert "pitch_up 0.20 -15 FL FR 1.02 -1.51 87 0.43 0.73 (40%) 0.0" in rows
+    assert "HL HR -0.87 2.27" in rows
 
 
 def test_without_opengl_one_line_names_the_package(no_opengl, capsys):

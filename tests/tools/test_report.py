@@ -72,13 +72,13 @@ def test_the_page_needs_nothing_else(tmp_path):
     drawing = Drawing()
     drawing.subplots().plot([0, 1])
     section = Section("errors", "Errors & more", "Text.", [TABLE], [Figure("Curve", drawing)])
-    page = write_report(tmp_path / "new", "Title", TABLE, [section])
+    page = write_report(tmp_path / "new", "KiRAS: Title", TABLE, [section])
     text = page.read_text()
     assert "Errors &amp; more" in text and "Errors &lt;of&gt; skills" in text
     assert text.count("<svg") == 1
     assert not re.search(r"(src|href)=\"(?!#)", text)  # no file, no address
     assert (tmp_path / "new/tables/errors_errors_of_skills.csv").is_file()
-    again = write_report(tmp_path / "new", "Title", TABLE, [section])
+    again = write_report(tmp_path / "new", "KiRAS: Title", TABLE, [section])
     assert again.read_text() == text
 
 

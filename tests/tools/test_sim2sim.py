@@ -103,8 +103,8 @@ def test_a_robot_upside_down_has_fallen(robot):
     simulator.step(robot.keyframe("walk").joint_pos)
     assert simulator.has_fallen
     simulator.place(still(robot, "walk"))
-    simulator.data.qpos[2] = 0.02  # the trunk is 5 cm thick
-    simulator.step(robot.keyframe("walk").joint_pos)
+    simulator.data.qpos[2], simulator.data.qpos[7:] = 0.02, np.pi / 2  # the trunk is 5 cm thick
+    simulator.step(np.full(8, np.pi / 2))  # with its legs level
     assert simulator.has_fallen
 
 

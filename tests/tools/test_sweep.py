@@ -110,7 +110,7 @@ def test_a_sweep_stops_goes_on_and_grows(tmp_path, capsys, interrupt):
     before = contents(sweep / "kiras")
 
     # one more configuration, which breaks; a key of the machine may change
-    overrides = "[learner.estimator.relative_step=1e30, learner.estimator.adaboot=off]"
+    overrides = "[learner.estimator.relative_step=1e9, learner.estimator.adaboot=off]"
     broken = f"{{cfg: smoke, overrides: {overrides}}}"
     write(tmp_path / "a.yaml", f"{{broken: {broken}, {configs[1:-1]}}}", "[1]")
     interrupt(0)  # never
@@ -165,7 +165,7 @@ def test_a_sweep_compares_all_configurations_of_a_seed_first(tmp_path, capsys, i
 
 def test_jobs_train_what_each_run_would_have_trained_alone(tmp_path, capsys):
     runs, jobs = tmp_path / "runs", min(2, len(os.sched_getaffinity(0)))
-    overrides = "[learner.estimator.relative_step=1e30, learner.estimator.adaboot=off]"
+    overrides = "[learner.estimator.relative_step=1e9, learner.estimator.adaboot=off]"
     configs = f"{{kiras: smoke, broken: {{cfg: smoke, overrides: {overrides}}}}}"
     command = ["--sweep", write(tmp_path / "a.yaml", configs, "[1]"), "--runs", str(runs)]
     before = os.sched_getaffinity(0)
@@ -236,8 +236,8 @@ def refusal(capsys, *argv):
 @pytest.mark.parametrize(
     ("text", "part"),
     [
-        ("", "leaves out|configs: give names"),
-        ("[1, 2]", "holds no keys, but [1, 2]"),
+        ("", "holds no keys"),
+        ("[1, 2]", "holds no keys"),
         ("name: [", "is not readable YAML"),
         ("configs: [smoke]", "leaves out: name, seeds"),
         ("name: a/b\nconfigs: [smoke]\nseeds: [1]", "'a/b' names a folder: use letters"),
