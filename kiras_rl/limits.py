@@ -93,7 +93,7 @@ LIMITS = {
     "env.randomization.joint_friction_factor": Limits(0, 1000),
     "env.randomization.joint_damping_factor": Limits(0, 1000),
     "env.randomization.encoder_bias": Limits(-10, 10),
-    "env.randomization.imu_tilt": Limits(-1, 1),
+    "env.randomization.imu_tilt": Limits(-3.2, 3.2),
     "env.randomization.gyro_bias": Limits(-10, 10),
     "env.randomization.action_delay": Limits(0, 50),
     "env.randomization.observation_delay": Limits(0, 50),
