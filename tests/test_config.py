@@ -408,3 +408,9 @@ def test_a_resumed_run_stays_the_same_run():
     check_resume_overrides(["iterations=5", "device=cpu", "sim.threads=1"])
     with pytest.raises(ConfigError, match="'num_envs' cannot change when a run is resumed"):
         check_resume_overrides(["iterations=5", "num_envs=5"])
+
+
+def test_of_the_quick_configuration_nothing_but_pushes_is_random():
+    drawn = vars(load_config("solo8_quick").env.randomization)
+    left = {name for name, value in drawn.items() if value is not None}
+    assert left == {"push_velocity", "push_interval"}
