@@ -9,7 +9,7 @@ import torch
 from kiras_rl.envs import rotations
 from kiras_rl.envs.randomness import UniformBuffer, scale_to
 from kiras_rl.envs.state import Task
-from kiras_rl.schema import CommandConfig, SkillConfig
+from kiras_rl.schema import CommandConfig, RoughTaskConfig, SkillConfig
 
 COLUMNS = {
     "command": 3,
@@ -32,16 +32,39 @@ class TaskSampler:
         skills: SkillConfig,
         num_skills: int,
         random: UniformBuffer,
-        device: torch.device,
+        is_rough: torch.Tensor,
+        on_rough: RoughTaskConfig | None = None,
     ) -> None:
-        """Begin with uniform skill probabilities."""
-        self._commands = commands
-        self._skills = skills
+        """Begin with uniform skill probabilities.
+
+        Args:
+            commands: Velocity commands.
+            skills: How skills change.
+            num_skills: S.
+            random: Numbers of each step.
+            is_rough: Worlds whose ground is rough, (N,) bool.
+            on_rough: What is different there; None for nothing.
+        """
+        device = is_rough.device
         self._num_skills = num_skills
         self._random = random
+        self._heading_gain = commands.heading_gain
+
+        def of_world(flat: float, rough: float | None) -> torch.Tensor:
+            value = torch.full_like(is_rough, flat, dtype=torch.float32)
+            return value if rough is None else torch.where(is_rough, rough, value)
+
+        rough = vars(on_rough) if on_rough else {}
+        forward = rough.get("lin_vel_x", commands.lin_vel_x)
         ranges = [commands.lin_vel_x, commands.lin_vel_y, commands.ang_vel_z]
-        self._low = torch.tensor([r[0] for r in ranges], device=device)
-        self._high = torch.tensor([r[1] for r in ranges], device=device)
+        self._low, self._high = torch.tensor(ranges, device=device).unbind(1)
+        self._forward_low = of_world(commands.lin_vel_x[0], forward[0])
+        self._forward_high = of_world(commands.lin_vel_x[1], forward[1])
+        self._zero = of_world(commands.zero_probability, rough.get("zero_probability"))
+        self._resample = of_world(commands.resample_probability, rough.get("resample_probability"))
+        self._holds = of_world(0.0, rough.get("heading_probability"))
+        self._switch = of_world(skills.switch_probability, rough.get("switch_probability"))
+        self._start_at_target = of_world(skills.start_at_target, rough.get("start_at_target"))
         self.probabilities = torch.full((num_skills,), 1.0 / num_skills, device=device)
 
     def advance(self, task: Task, reset: torch.Tensor) -> Task:
@@ -53,8 +76,8 @@ class TaskSampler:
             task: Tasks of this step.
             reset: Worlds that begin an episode, (N,) bool.
         """
-        resample = self._chance("command_resample", self._commands.resample_probability)
-        switch = self._chance("skill_switch", self._skills.switch_probability)
+        resample = self._chance("command_resample", self._resample)
+        switch = self._chance("skill_switch", self._switch)
         renewed = reset | resample
         command = torch.where(renewed[:, None], self.draw_command(), task.command)
         heading = torch.where(renewed, self._draw_heading(command), task.heading)
@@ -71,7 +94,7 @@ class TaskSampler:
             yaw: Headings now, (N,), rad.
         """
         heading = torch.where(task.heading.isinf(), yaw, task.heading)
-        rate = self._commands.heading_gain * rotations.wrap(heading - yaw)
+        rate = self._heading_gain * rotations.wrap(heading - yaw)
         rate = rate.clamp(self._low[2], self._high[2])
         command = task.command.clone()
         command[:, 2] = torch.where(heading.isnan(), command[:, 2], rate)
@@ -79,15 +102,16 @@ class TaskSampler:
 
     def _draw_heading(self, command: torch.Tensor) -> torch.Tensor:
         """Return +inf, the heading of the moment, for some of the moving worlds, else NaN."""
-        holds = self._chance("heading", self._commands.heading_probability)
+        holds = self._chance("heading", self._holds)
         return torch.where(holds & command.any(dim=1), torch.inf, torch.nan)
 
     def draw_command(self) -> torch.Tensor:
         """Return new commands, (N, 3)."""
-        command = self._low + (self._high - self._low) * self._random["command"]
-        forward, least = command[:, 0], self._commands.least_lin_vel_x
-        command[:, 0] = forward.abs().clamp(min=least).copysign(forward)
-        zero = self._chance("command_zero", self._commands.zero_probability)
+        uniform = self._random["command"]
+        command = self._low + (self._high - self._low) * uniform
+        span = self._forward_high - self._forward_low
+        command[:, 0] = self._forward_low + span * uniform[:, 0]
+        zero = self._chance("command_zero", self._zero)
         return command * (~zero)[:, None]
 
     def draw_skill(self) -> torch.Tensor:
@@ -101,7 +125,7 @@ class TaskSampler:
         uniform = self._random["start"]
         offset = scale_to(uniform[:, 1], 1.0, float(self._num_skills)).long()
         other = (skill + offset) % self._num_skills
-        return torch.where(uniform[:, 0] < self._skills.start_at_target, skill, other)
+        return torch.where(uniform[:, 0] < self._start_at_target, skill, other)
 
-    def _chance(self, column: str, probability: float) -> torch.Tensor:
+    def _chance(self, column: str, probability: torch.Tensor) -> torch.Tensor:
         return self._random[column][:, 0] < probability

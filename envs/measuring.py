@@ -23,6 +23,7 @@ def measure(
         fallen: Worlds that terminate by failure, or whose physics broke or ran out of memory:
             what comes after is another life, (N,) bool.
     """
+    foot_load, limb_load = robot.loads()
     return Measurements(
         base_pos_w=robot.base_pos_w.clone(),
         base_quat_w=robot.base_quat_w.clone(),
@@ -43,6 +44,8 @@ def measure(
         foot_stands=robot.foot_stands,
         foot_height=robot.foot_height,
         limb_contact=(robot.limb_force > CONTACT_FORCE).any(dim=1),
+        foot_load=foot_load,
+        limb_load=limb_load,
         distance=distance,
         fallen=fallen,
     )

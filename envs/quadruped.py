@@ -127,17 +127,20 @@ class QuadrupedEnv(SkillEnv):
         if self._library:
             columns |= curriculum.COLUMNS | {"yaw": 1}
         self._random = UniformBuffer(self.num_envs, columns, generator)
-        self._tasks = TaskSampler(
-            cfg.commands, cfg.skills, len(self.skills), self._random, self.device
-        )
         self._randomizer = Randomizer(cfg.randomization, self.scene, self.sim, self._random)
         self._sensors = Sensors(cfg.randomization, self.sim, self.scene.sensors, self._random)
         self._curriculum = None
         if self._library:
-            self._curriculum = Curriculum(
-                self._library, len(self.skills), self._random, cfg.terrain.start_level
-            )
+            self._curriculum = Curriculum(self._library, len(self.skills), self._random)
         self._is_flat = self._curriculum.is_flat if self._curriculum else self._all
+        self._tasks = TaskSampler(
+            cfg.commands,
+            cfg.skills,
+            len(self.skills),
+            self._random,
+            is_rough=~self._is_flat,
+            on_rough=cfg.terrain.task if cfg.terrain else None,
+        )
         self._placed: torch.Tensor | None = None  # tiles chosen from outside, (N,)
         self._advance = Recorded(
             self._judge_and_begin,
@@ -260,6 +263,7 @@ class QuadrupedEnv(SkillEnv):
             memory=self._memory,
             fresh=self._length == 1,
             fallen=fallen,
+            weight=GRAVITY * self.mass,
             dt=self.step_dt,
         )
         terms = self._rewards(step)
@@ -292,8 +296,10 @@ class QuadrupedEnv(SkillEnv):
         self._randomizer.reset(mask)
         self._sensors.reset(mask)
         if self._curriculum:
-            tile = self._curriculum.tiles(self.task.skill) if self._placed is None else self._placed
-            self._write_terrain(mask, tile)
+            self._curriculum.begin(mask, self.task.skill)
+            self._write_terrain(
+                mask, self._curriculum.tiles() if self._placed is None else self._placed
+            )
         qpos, qvel = self._postures.draw_begin(start, self._random)
         joint_pos = qpos[:, 7:]
         self.sim.write_state(mask, qpos, qvel, joint_pos)
@@ -395,6 +401,10 @@ class QuadrupedEnv(SkillEnv):
     def set_skill_probabilities(self, probabilities: torch.Tensor) -> None:
         """Set the probabilities with which new skills are drawn, (S,)."""
         self._tasks.probabilities = probabilities.to(self.device)
+
+    def set_progress(self, progress: float) -> None:
+        """Set what changes over a phase to its value at this share of it, in [0, 1]."""
+        self._rewards.set_progress(progress)
 
     def measure(self) -> Measurements:
         """Return the measurements of the last step, before its resets."""

@@ -3,6 +3,8 @@
 A term's value is positive and its weight in the YAML gives the sign; only `feet_drag` is negative,
 for the paper gives it a positive weight. The paper's table is cfg/paper.yaml.
 
+A weight is a number, or a schedule of [share of the phase, weight] points.
+
 Terms of the gait judge a foot when it lands or lifts off, from what is remembered of its swing or
 stance (kiras_rl.envs.memory), and leave a robot alone that is told to stand.
 """
@@ -19,6 +21,7 @@ from kiras_rl.envs.lookup import find_function
 from kiras_rl.envs.memory import remembering
 from kiras_rl.envs.shapes import evaluate
 from kiras_rl.envs.state import Step
+from kiras_rl.schedules import piecewise_linear
 from kiras_rl.schema import RewardConfig
 
 
@@ -209,21 +212,30 @@ def stand_still_pose(step: Step) -> torch.Tensor:
     return torch.where(step.stands, error, 0.0)
 
 
-def skill_height(step: Step, sigma: float) -> torch.Tensor:
-    """Return exp(-(error / sigma)^2) of the base height (the manual reward of w/o SIL)."""
-    error = step.robot.base_height - step.keyframes.height[step.task.skill]
-    return torch.exp(-(error / sigma).square())
+def skill_height(step: Step, sigma: float, slack: float = 0.0) -> torch.Tensor:
+    """Return exp(-(error / sigma)^2) of the base height; errors up to `slack` m cost nothing."""
+    error = (step.robot.base_height - step.keyframes.height[step.task.skill]).abs()
+    return torch.exp(-((error - slack).clamp(min=0.0) / sigma).square())
 
 
-def skill_orientation(step: Step, sigma: float) -> torch.Tensor:
-    """Return exp(-(error / sigma)^2) of projected gravity (the manual reward of w/o SIL)."""
+def skill_orientation(step: Step, sigma: float, slack: float = 0.0) -> torch.Tensor:
+    """Return exp(-(error / sigma)^2) of projected gravity; errors up to `slack` cost nothing."""
     error = step.robot.gravity_b - step.keyframes.gravity_b[step.task.skill]
-    return torch.exp(-error.square().sum(-1) / sigma**2)
+    error = torch.linalg.vector_norm(error, dim=-1)
+    return torch.exp(-((error - slack).clamp(min=0.0) / sigma).square())
 
 
 def termination(step: Step) -> torch.Tensor:
     """Return 1 where an episode ends by failure."""
     return step.fallen.float()
+
+
+def limb_load(step: Step) -> torch.Tensor:
+    """Return the sum of the loads of thighs and shanks, body weights, each at most 1.
+
+    Unlike a count of touches it tells a scrape from a knee that is walked on.
+    """
+    return (step.robot.limb_force / step.weight).clamp(max=1.0).sum(-1)
 
 
 def _landing(step: Step) -> torch.Tensor:
@@ -250,9 +262,15 @@ class RewardSum:
         self.is_termination = torch.tensor([n == "termination" for n in terms], device=device)
         self._terms = [_bind(name, values) for name, values in terms.items()]
         self.functions = [term.func for term in self._terms]
-        scale = step_dt if config.scale_by_dt else 1.0
-        weights = [float(values["weight"]) * scale for values in terms.values()]
-        self._weights = torch.tensor(weights, device=device)
+        self._scale = step_dt if config.scale_by_dt else 1.0
+        self._schedules = [_schedule(values["weight"]) for values in terms.values()]
+        self._weights = torch.empty(len(terms), device=device)
+        self.set_progress(0.0)
+
+    def set_progress(self, progress: float) -> None:
+        """Set the weights to those of this share of the phase, in [0, 1]."""
+        weights = [piecewise_linear(points, progress) for points in self._schedules]
+        self._weights.copy_(self._scale * torch.tensor(weights))  # in place: a graph reads it
 
     def __call__(self, step: Step) -> torch.Tensor:
         """Return the weighted terms, (N, number of terms).
@@ -287,6 +305,11 @@ def _bind(name: str, values: dict) -> partial[torch.Tensor]:
         if signature.parameters[key].annotation in ("int", "float"):
             _check_number(f"env.rewards.terms.{name}.{key}", value)
     return partial(function, **parameters)
+
+
+def _schedule(weight: float | list[list[float]]) -> list[list[float]]:
+    """Return the weight as [share of the phase, weight] points."""
+    return weight if isinstance(weight, list) else [[0.0, weight]]
 
 
 def _check_number(where: str, value: object) -> None:

@@ -154,6 +154,7 @@ class RobotState:
         squared = _squared_norms(record[:, :, layout.forces_w])  # (N, K, geoms), N^2
         # Largest force of the physics steps, so that no short contact is missed, (N, ...), N
         peaks = squared.amax(dim=1).sqrt()
+        self._forces = squared
         self.foot_force, self.base_force, self.limb_force = peaks.split(layout.geoms, dim=1)
         feet = squared[:, -1, : layout.geoms[0]]
         self.foot_contact = feet > CONTACT_FORCE**2  # (N, F) bool
@@ -164,6 +165,12 @@ class RobotState:
         self.joint_torque = last[:, layout.joint_torque]  # (N, J), N m
         self._torques = record[:, :, layout.joint_torque].abs()  # (N, K, J), N m
         self.peak_torque = self._torques.amax(dim=1)  # of the physics steps, (N, J), N m
+
+    def loads(self) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return the mean forces of the step on all feet, and on trunk and limbs, (N,) each, N."""
+        forces = self._forces.sqrt().mean(dim=1)
+        feet = self._layout.geoms[0]
+        return forces[:, :feet].sum(dim=1), forces[:, feet:].sum(dim=1)
 
     def saturation(self, limit: torch.Tensor) -> torch.Tensor:
         """Return the share of the physics steps in which a torque is at its limit, (N,).
@@ -286,6 +293,7 @@ class Step:
         fresh: Worlds in the first step of an episode, (N,) bool; `delta_torques` is zero there,
             for there is no torque of a step before.
         fallen: Worlds that terminate by failure, (N,) bool.
+        weight: Of a robot before randomization, N.
         dt: Duration of the step, s.
     """
 
@@ -302,6 +310,7 @@ class Step:
     memory: Memory
     fresh: torch.Tensor
     fallen: torch.Tensor
+    weight: float
     dt: float
 
 

@@ -69,7 +69,7 @@ class Draw:
     Attributes:
         difficulty: 0 at the lowest level, 1 at the top level.
         scale: Factor of all lengths of obstacles, for the size of the robot.
-        inverted: True in every second variant, for types that lead either up or down.
+        inverted: True in every second variant, for a type that leads either up or down.
         rng: Random numbers of this tile alone.
     """
 
@@ -117,10 +117,7 @@ def slopes(draw: Draw, angle: Range) -> Tile:
     Raises:
         ValueError: Another inclination.
     """
-    degrees = draw.value(angle)
-    if not 0.0 <= degrees <= 60.0:
-        raise ValueError(f"an angle of {degrees:g} degrees; allowed are 0 to 60")
-    steepness = np.tan(np.radians(degrees))
+    steepness = _steepness(draw, angle)
 
     def ground(x: np.ndarray, y: np.ndarray) -> np.ndarray:
         way = np.maximum(np.maximum(abs(x), abs(y)), PLATFORM)
@@ -161,20 +158,88 @@ def footholds(draw: Draw, plate: Range, gap: Range, depth: Range, unevenness: Ra
     return _separate(inner, inner + draw.length(plate), top + uneven, centre=top)
 
 
-def stairs(draw: Draw, riser: Range, tread: Range) -> Tile:
-    """Return steps up from the platform, or down from it where inverted.
+def stairs_up(draw: Draw, riser: Range, tread: Range) -> Tile:
+    """Return steps up from the platform.
 
     Args:
         draw: Which tile.
         riser: Height of a step, m.
         tread: Depth of a step, m; the outermost takes what is left of the tile.
     """
-    count = int((HALF - PLATFORM) / draw.length(tread))
-    edges = PLATFORM + draw.length(tread) * np.arange(count + 1)
-    edges[-1] = HALF
-    steps = np.arange(count + 1)
-    heights = draw.length(riser) * (steps[::-1] if draw.inverted else steps)
-    return Tile(edges, np.tile(heights[:, None], (1, 4)))
+    edges, tops = _steps(draw, riser, tread)
+    return Tile(edges, tops)
+
+
+def stairs_down(draw: Draw, riser: Range, tread: Range) -> Tile:
+    """Return steps down from the platform; parameters as `stairs_up`."""
+    edges, tops = _steps(draw, riser, tread)
+    return Tile(edges, tops[::-1].copy())
+
+
+def pits(draw: Draw, depth: Range, width: Range, spacing: Range) -> Tile:
+    """Return trenches to step down into and up out of, wide enough to stand in.
+
+    Args:
+        draw: Which tile.
+        depth: Of a trench, m.
+        width: Of a trench, m.
+        spacing: From one trench to the next, m.
+    """
+    trench, step = draw.length(width), draw.length(spacing)
+    inner = np.arange(PLATFORM + trench, HALF - (step - trench), step)
+    top = draw.length(depth)
+    return _separate(inner, inner + (step - trench), np.full((len(inner), 4), top), centre=top)
+
+
+def plates(draw: Draw, height: Range, width: Range) -> Tile:
+    """Return plates side by side, each of another height: steps up and down in no order.
+
+    Args:
+        draw: Which tile.
+        height: Of the highest, m; the platform has half of it.
+        width: Of a plate in the direction of walking, m.
+    """
+    edges = np.arange(PLATFORM, HALF + 1e-9, draw.length(width))
+    top = draw.length(height)
+    tops = top * draw.rng.uniform(0.0, 1.0, (len(edges), 4))
+    tops[0] = top / 2
+    return Tile(edges, tops)
+
+
+def ramps(draw: Draw, angle: Range, length: Range) -> Tile:
+    """Return ridges: slabs that are tilted up and down in turn.
+
+    Args:
+        draw: Which tile.
+        angle: Inclination, 0 to 60 degrees.
+        length: Of a slab along the ground, m.
+
+    Raises:
+        ValueError: Another inclination.
+    """
+    steepness, slab = _steepness(draw, angle), draw.length(length)
+
+    def ground(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        way = np.maximum(np.maximum(abs(x), abs(y)) - PLATFORM, 0.0)
+        return steepness * (slab - abs(way % (2 * slab) - slab))
+
+    return Tile(np.zeros(0), np.zeros((0, 4)), ground)
+
+
+def rough(draw: Draw, height: Range) -> Tile:
+    """Return ground that is uneven at the size of a foot.
+
+    Args:
+        draw: Which tile.
+        height: Between the lowest and the highest points, m; neighbours are a cell apart.
+    """
+    top = draw.length(height)
+
+    def ground(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        outside = np.maximum(abs(x), abs(y)) > PLATFORM + 0.1  # the platform's edge is level, too
+        return top * draw.rng.uniform(size=x.shape) * outside
+
+    return Tile(np.zeros(0), np.zeros((0, 4)), ground, rough=False)
 
 
 def side_bounds(inner: float, outer: float) -> tuple[tuple[float, float, float, float], ...]:
@@ -185,6 +250,23 @@ def side_bounds(inner: float, outer: float) -> tuple[tuple[float, float, float, 
         (-inner, inner, inner, outer),
         (-inner, inner, -outer, -inner),
     )
+
+
+def _steepness(draw: Draw, angle: Range) -> float:
+    """Return the rise per length of an inclination in degrees."""
+    degrees = draw.value(angle)
+    if not 0.0 <= degrees <= 60.0:
+        raise ValueError(f"an angle of {degrees:g} degrees; allowed are 0 to 60")
+    return np.tan(np.radians(degrees))
+
+
+def _steps(draw: Draw, riser: Range, tread: Range) -> tuple[np.ndarray, np.ndarray]:
+    """Return the edges and ascending tops of a flight that fills the tile."""
+    count = int((HALF - PLATFORM) / draw.length(tread))
+    edges = PLATFORM + draw.length(tread) * np.arange(count + 1)
+    edges[-1] = HALF
+    heights = draw.length(riser) * np.arange(count + 1)
+    return edges, np.tile(heights[:, None], (1, 4))
 
 
 def _separate(inner: np.ndarray, outer: np.ndarray, tops: np.ndarray, centre: float = 0.0) -> Tile:

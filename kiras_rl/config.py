@@ -31,11 +31,17 @@ RESUME_OVERRIDES = ("iterations", "finetuning.iterations", *MACHINE_KEYS)
 """Keys that may change when a run is resumed: none of them changes what was learned so far."""
 
 OBSOLETE = tuple(
-    f"{phase}learner.estimator.{key}"
+    f"{phase}{key}"
     for phase in ("", "finetuning.")
-    for key in ("learning_rate", "full_rate_std")
+    for key in (
+        "learner.estimator.learning_rate",  # relative_step is in their place
+        "learner.estimator.full_rate_std",
+        "env.commands.least_lin_vel_x",  # env.terrain.task has what is asked on rough ground
+        "env.commands.heading_probability",
+        "env.terrain.start_level",  # levels rise as fast as the policy can follow
+    )
 )
-"""Keys of what earlier versions saved; `learner.estimator.relative_step` is in their place."""
+"""Keys of what earlier versions saved."""
 
 
 class ConfigError(ValueError):

@@ -88,6 +88,8 @@ class Measurements:
         foot_stands: Feet on the ground in any of the physics steps, (N, F) bool.
         foot_height: Of their lowest points above the ground, (N, F), m.
         limb_contact: Worlds where a thigh or shank touched the ground, bool.
+        foot_load: Mean force on all feet, N.
+        limb_load: Mean force on trunk, thighs and shanks, N.
         distance: How far the base is from the middle of its tile, the larger of |x| and |y|, m.
         fallen: Worlds that terminate by failure at this step, bool.
     """
@@ -111,6 +113,8 @@ class Measurements:
     foot_stands: torch.Tensor
     foot_height: torch.Tensor
     limb_contact: torch.Tensor
+    foot_load: torch.Tensor
+    limb_load: torch.Tensor
     distance: torch.Tensor
     fallen: torch.Tensor
 
@@ -206,6 +210,9 @@ class SkillEnv(VecEnv):
     @abstractmethod
     def set_skill_probabilities(self, probabilities: torch.Tensor) -> None:
         """Set the probabilities with which new skills are drawn, (S,)."""
+
+    def set_progress(self, progress: float) -> None:
+        """Set what changes over a phase to its value at this share of it, in [0, 1]."""
 
     @abstractmethod
     def keyframe_observations(self) -> torch.Tensor:

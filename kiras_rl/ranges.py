@@ -7,7 +7,6 @@ from collections.abc import Iterable, Iterator
 from typing import Any
 
 from kiras_rl.limits import SCHEDULES, find_outside
-from kiras_rl.schedules import piecewise_linear
 
 RANGES = (
     "env.commands.lin_vel_x",
@@ -29,10 +28,14 @@ RANGES = (
     "env.randomization.observation_delay",
     "env.randomization.action_delay",
     "env.randomization.push_velocity",
+    "env.terrain.task.lin_vel_x",
     "learner.ppo.learning_rate_range",
     "evaluation.terrain.command",
 )
 """[low, high]. Pairs of terrain are no ranges: from the lowest to the top level they may fall."""
+
+POINTS = "[share of the phase, value] points in ascending order"
+"""What a schedule is."""
 
 NOT_EMPTY = ("learner.ppo.actor_dims", "learner.ppo.critic_dims")
 
@@ -80,7 +83,7 @@ def _find_disorder(values: dict) -> str | None:
             return f"{key}={[low, high]}: give [low, high], the lower number first"
     for key, value in _given(values, SCHEDULES):
         if not _is_schedule(value):
-            return f"{key}={value}: give [fraction of T1, value] points in ascending order"
+            return f"{key}={value}: give {POINTS}"
     return None
 
 
@@ -100,10 +103,17 @@ def _find_no_number(values: dict) -> str | None:
             if not isinstance(entry, dict):
                 continue  # null, or refused where the term is looked up
             for key in TERMS[where]:
-                if key in entry and not _is_number(entry[key]):
+                if key in entry and (problem := _value_problem(key, entry[key])):
                     shown = "null" if entry[key] is None else repr(entry[key])
-                    return f"{where}.{name}.{key}={shown}: must be a number"
+                    return f"{where}.{name}.{key}={shown}: {problem}"
     return None
+
+
+def _value_problem(key: str, value: Any) -> str | None:
+    """Return what is wrong with a number of a term, or None; a weight may be a schedule."""
+    if key == "weight" and isinstance(value, list):
+        return None if _is_schedule(value) else f"give a number or {POINTS}"
+    return None if _is_number(value) else "must be a number"
 
 
 def _find_large_batches(values: dict) -> str | None:
@@ -132,11 +142,8 @@ def _rollout(values: dict) -> int:
 
 
 def _is_schedule(points: list) -> bool:
-    try:
-        piecewise_linear(points, 0.0)
-    except ValueError:
-        return False
-    return all(len(point) == 2 for point in points)
+    pairs = all(isinstance(p, list) and len(p) == 2 and all(map(_is_number, p)) for p in points)
+    return pairs and bool(points) and points == sorted(points, key=lambda point: point[0])
 
 
 def _is_number(value: Any) -> bool:

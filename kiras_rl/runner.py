@@ -199,6 +199,7 @@ class KirasRunner(OnPolicyRunner):
         totals = torch.zeros((), device=self.device)
         num_steps = self.cfg["num_steps_per_env"]
         self._env_time = self._physics_time = 0.0
+        self.env.set_progress(self.alg.progress)
         obs = self.env.get_observations()
         # no_grad, not inference_mode: what is recorded here is trained on, and edited, later
         with torch.no_grad(), single_threaded(self.device):

@@ -50,10 +50,8 @@ class CommandConfig:
     lin_vel_x: tuple[float, float]
     lin_vel_y: tuple[float, float]
     ang_vel_z: tuple[float, float]
-    least_lin_vel_x: float
     zero_probability: float
     resample_probability: float
-    heading_probability: float
     heading_gain: float
 
 
@@ -101,6 +99,18 @@ class RandomizationConfig:
 
 
 @dataclass
+class RoughTaskConfig:
+    """What robots on rough ground are asked for, where it is not what those on flat ground are."""
+
+    lin_vel_x: tuple[float, float]
+    zero_probability: float
+    resample_probability: float
+    heading_probability: float
+    switch_probability: float
+    start_at_target: float
+
+
+@dataclass
 class TerrainConfig:
     """Tiles: type name -> {proportion, parameters of the type}; null removes a type.
 
@@ -108,12 +118,12 @@ class TerrainConfig:
     """
 
     levels: int
-    start_level: int
     variants: int
     scale: float
     seed: int
     cell: float
     noise: tuple[float, float]
+    task: RoughTaskConfig
     types: dict[str, Any]
 
 
@@ -164,6 +174,7 @@ class ImitationConfig:
     """Self-imitation learning."""
 
     reward_weight: float
+    whole_from: float
     discriminator: DiscriminatorConfig
     premium: PremiumConfig
 

@@ -222,7 +222,7 @@ def test_the_page_on_configuration_shows_every_range():
         "env.rewards.terms.torques.weight=1.0e30",
         "env.observations.proprio.joint_pos.scale=0",
         "env.observations.proprio.joint_pos.noise=-1",
-        "finetuning.env.terrain.types.stairs.proportion=-1",
+        "finetuning.env.terrain.types.stairs_up.proportion=-1",
         "learner.ppo.gamma=1.5",
         "learner.ppo.num_steps=1",
         "env.skills.switch_probability=7",
@@ -284,8 +284,8 @@ def test_every_pair_is_a_range_but_that_of_the_levels_of_terrain():
         ("env.rewards.terms.torques.weight=.nan", "nan"),
         ("env.observations.critic.base_lin_vel.scale=.inf", "inf"),
         ("finetuning.retention.residual_weight=.nan", "nan"),
-        ("finetuning.env.terrain.types.stairs.riser=[0.1,.nan]", "[0.1, nan]"),
-        ("finetuning.env.terrain.types.stairs.proportion=.nan", "nan"),
+        ("finetuning.env.terrain.types.stairs_up.riser=[0.1,.nan]", "[0.1, nan]"),
+        ("finetuning.env.terrain.types.stairs_up.proportion=.nan", "nan"),
     ],
 )
 def test_what_is_not_finite_is_refused_wherever_it_stands(override, shown):
@@ -331,7 +331,7 @@ def test_of_every_group_of_terms_one_is_left(key):
     ("override", "message"),
     [
         ("env.terrain.seed=-1", f"allowed are 0 to {2**63 - 1}"),
-        ("env.terrain.types.stairs.proportion='abc'", "must be a number"),
+        ("env.terrain.types.stairs_up.proportion='abc'", "must be a number"),
         ("env.rewards.terms.torques.weight='abc'", "must be a number"),
         ("env.commands.lin_vel_x=[0.6, 0.3]", "give [low, high], the lower number first"),
         ("learner.ppo.learning_rate=-1.0", "allowed are 0 to 10"),

@@ -49,7 +49,18 @@ def test_finetuning_has_its_changes_and_no_imitation():
     assert alone.finetuning is None
     assert alone.sim.threads == 7
     assert alone.env.terrain.scale == 1.5
-    assert list(alone.env.terrain.types) == ["flat", "slopes", "bars", "footholds", "stairs"]
+    assert list(alone.env.terrain.types) == [
+        "flat",
+        "slopes",
+        "bars",
+        "footholds",
+        "stairs_up",
+        "stairs_down",
+        "pits",
+        "plates",
+        "ramps",
+        "rough",
+    ]
 
 
 def test_the_paper_s_rewards_hold_in_both_phases():

@@ -46,7 +46,7 @@ examples:
   kiras-collect --out walks                           the policy shipped with Solo-8
   kiras-collect runs/solo8_quick/2026-01-31_12-00-00 --skills walk,crawl --command 0.1:0.5 --out a
   kiras-collect policy.onnx --nominal --format lerobot --out b
-  kiras-collect policy.onnx --terrain stairs:4 --command=0.2:0.6 --out c
+  kiras-collect policy.onnx --terrain stairs_up:4 --command=0.2:0.6 --out c
 
 then, in Python:
   dataset = kiras_rl.dataset.load_dataset("walks")

@@ -29,12 +29,12 @@ BY_TAG = (
 """Panels of every run: one line a skill, or one a tag."""
 
 TERRAIN_BY_SKILL = (
-    ("mean level of a skill", "Terrain/level_{}"),
-    ("strict success of a skill, deterministic", "Eval_{}/terrain_strict"),
+    ("mean frontier of a skill", "Terrain/level_{}"),
+    ("success on feet only, of a skill, deterministic", "Eval_{}/terrain_feet_only"),
 )
 TERRAIN_BY_TYPE = (
-    ("mean level of a terrain", "Terrain/level_{}"),
-    ("strict success on a terrain, deterministic", "Eval_terrain/strict_{}"),
+    ("mean frontier on a terrain", "Terrain/level_{}"),
+    ("success on feet only, on a terrain, deterministic", "Eval_terrain/feet_only_{}"),
 )
 """Panels of a run with terrain."""
 
@@ -53,7 +53,7 @@ def draw_curves(run_dir: Path) -> Path:
 
     series = read_scalars(run_dir)
     skills = _names(series, "Eval_", "/height")
-    types = _names(series, "Eval_terrain/strict_", "")
+    types = _names(series, "Eval_terrain/feet_only_", "")
     panels = [(title, [(pattern.format(s), s) for s in skills]) for title, pattern in BY_SKILL]
     panels += [(title, [(tag, tag.split("/")[1]) for tag in tags]) for title, tags in BY_TAG]
     if types:
@@ -63,7 +63,7 @@ def draw_curves(run_dir: Path) -> Path:
             panels.append((title, [(pattern.format(t), t) for t in types]))
         levels = _names(series, "Terrain/success_level_", "")
         lines = [(f"Terrain/success_level_{k}", f"level {k}") for k in levels]
-        panels.append(("share of episodes that cross, by level", lines))
+        panels.append(("share of trials that succeed in training, by level", lines))
         panels.append(("distance to the flat policy", [("Residual/distance", "action")]))
     rows = -(-len(panels) // COLUMNS)
     figure, axes = plt.subplots(rows, COLUMNS, figsize=(18, 3.75 * rows), layout="constrained")

@@ -46,10 +46,10 @@ Live, the page and --terminal show their keys. With --table, --trace, --frames o
 --script or --command alone, a script is driven: without --script the robot stands for one second
 and then shows every skill for four. A robot that falls is put back into the posture of its skill.
 
---terrain stairs:4:1 is variant 1 of level 4 of the stairs; level and variant are 0 where they are
-left out. The tiles are those of the policy's run, or else of its robot's configuration; odd
-variants of stairs and slopes lead down. At the end of its tile the robot starts again in the
-middle.
+--terrain stairs_up:4:1 is variant 1 of level 4 of stairs that lead up; level and variant are 0
+where they are left out. The tiles are those of the policy's run, or else of its robot's
+configuration; odd variants of slopes lead down. At the end of its tile the robot starts again in
+the middle.
 Exit status: 0, also after Ctrl-C, or 2 if something was wrong with what was given.
 """
 
@@ -60,7 +60,7 @@ examples:
   kiras-play --host 0.0.0.0 --port 9000             let other machines see the page, and drive
   kiras-play --terminal                             drive with keys where there is no browser
   kiras-play runs/solo8/2026-01-01_12-00-00 --follow    watch a training: newest checkpoint
-  kiras-play --terrain stairs:4                     on stairs, live; or with what follows
+  kiras-play --terrain stairs_up:4                     on stairs, live; or with what follows
   kiras-play --table                                every skill's errors
   kiras-play --trace trace.png                      posture, speed, contacts, torques over time
   kiras-play --frames strip.png --video walk.mp4    pictures and a film

@@ -5,11 +5,13 @@ from __future__ import annotations
 import math
 import time
 from collections import deque
+from collections.abc import Iterator
 
 from rich.console import Console
 from rich.live import Live
 from rich.text import Text
 
+from kiras_rl.evaluation.terrain import TerrainResult
 from kiras_rl.status import Status
 
 PLAIN_INTERVAL = 30.0  # s between lines where the output is not a terminal
@@ -68,14 +70,20 @@ class Progress:
         if status.evaluation:
             parts.append("h [cm], pitch, v: " + " ".join(map(_brief, status.evaluation.values())))
         if status.terrain:
-            shares = zip(status.terrain.terrains, status.terrain.strict.mean(dim=1), strict=True)
-            parts.append("crossed [%]: " + " ".join(f"{k} {100 * v:.0f}" for k, v in shares))
+            parts.append("success/feet only [%]: " + " ".join(_shares(status.terrain)))
         return " | ".join(parts)
 
 
 def _brief(result: object) -> str:
     height, pitch = 100 * result.height, math.degrees(result.pitch)
     return f"{height:.0f},{pitch:+.0f},{result.velocity:.2f}"
+
+
+def _shares(terrain: TerrainResult) -> Iterator[str]:
+    """Yield a terrain's success and success on feet only, of all skills, in %."""
+    success, feet_only = (x.mean(dim=1).tolist() for x in (terrain.success, terrain.feet_only))
+    for name, a, b in zip(terrain.terrains, success, feet_only, strict=True):
+        yield f"{name} {100 * a:.0f}/{100 * b:.0f}"
 
 
 def _duration(seconds: float) -> str:

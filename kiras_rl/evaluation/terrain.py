@@ -15,6 +15,7 @@ RADIUS = 3.0  # m from the middle of the tile, beyond all but the last obstacles
 TIME_LIMIT = 20.0  # s
 PATIENCE = 2.0  # times the duration of the way at the commanded speed
 LIMB_SHARE = 0.05  # of the steps with a thigh or shank on the ground, at most, to succeed strictly
+LOAD_SHARE = 0.1  # of all impulse from the ground on trunk, thighs and shanks, at most: feet only
 
 
 @dataclass(frozen=True)
@@ -57,6 +58,7 @@ class Outcomes:
 
     Attributes:
         success: Went RADIUS far within PATIENCE times the duration of the way and TIME_LIMIT.
+        feet_only: And did so with at most LOAD_SHARE of the ground's impulse on anything but feet.
         strict: And did so with thighs or shanks on the ground in at most LIMB_SHARE of the steps.
         kept: Succeeded, and kept the skill's keyframe on the way: mean errors of the moving
             averages of height and pitch over its Stance are at most those of FLOOR.
@@ -64,6 +66,7 @@ class Outcomes:
     """
 
     success: torch.Tensor
+    feet_only: torch.Tensor
     strict: torch.Tensor
     kept: torch.Tensor
     fell: torch.Tensor
@@ -89,7 +92,8 @@ def run_trials(env: SkillEnv, policy: Policy, trials: Trials, seed: int = SEED) 
     obs = env.reset(trials.skill, command, hold_heading=True)
     limit = (PATIENCE * RADIUS / trials.speed).clamp(max=TIME_LIMIT) / env.step_dt
     success = torch.zeros(env.num_envs, dtype=torch.bool, device=env.device)
-    fell, limb_steps, steps = success.clone(), torch.zeros_like(limit), torch.zeros_like(limit)
+    fell = success.clone()
+    steps, limb_steps, load, limb_load = (torch.zeros_like(limit) for _ in range(4))
     stance, postures = Stance(env, trials.skill), []
     for step in range(int(limit.max().ceil())):
         obs = env.step(policy(obs))[0]
@@ -98,12 +102,15 @@ def run_trials(env: SkillEnv, policy: Policy, trials: Trials, seed: int = SEED) 
         postures.append((*stance.read(now), running))
         steps += running
         limb_steps += running & now.limb_contact
+        limb_load += running * now.limb_load
+        load += running * (now.limb_load + now.foot_load)
         fell |= running & now.fallen
         success |= running & ~now.fallen & (now.distance >= RADIUS)
         if step % 25 == 0 and not (~success & ~fell & (step < limit)).any():
             break
     return Outcomes(
         success=success,
+        feet_only=success & (limb_load <= LOAD_SHARE * load),
         strict=success & (limb_steps <= LIMB_SHARE * steps),
         kept=success & _keeps(env, trials.skill, postures),
         fell=fell,
@@ -130,6 +137,7 @@ class TerrainResult:
         skills: Names of the skills.
         level: Difficulty level of all trials.
         success: (terrains, S).
+        feet_only: (terrains, S).
         strict: (terrains, S).
     """
 
@@ -137,16 +145,17 @@ class TerrainResult:
     skills: tuple[str, ...]
     level: int
     success: torch.Tensor
+    feet_only: torch.Tensor
     strict: torch.Tensor
 
     def score(self) -> float:
-        """Return 0 where every trial succeeds strictly, 2 where none does."""
-        return 2.0 * (1.0 - self.strict.mean().item())
+        """Return 0 where every trial succeeds on feet only, 2 where none succeeds at all."""
+        return 2.0 - (self.success + self.feet_only).mean().item()
 
     def as_scalars(self) -> dict[str, float]:
         """Return the shares by log name, for each type and for each skill."""
         scalars = {}
-        for kind in ("success", "strict"):
+        for kind in ("success", "feet_only", "strict"):
             shares = getattr(self, kind)
             for name, value in zip(self.terrains, shares.mean(dim=1).tolist(), strict=True):
                 scalars[f"Eval_terrain/{kind}_{name}"] = value
@@ -174,8 +183,11 @@ def evaluate_terrain(
     """
     types = rough_types(env.terrains)
     outcomes = cross(env, policy, [Obstacle(name, level) for name in types], robots, speeds)
-    success, strict = (x.float().mean(dim=-1).cpu() for x in (outcomes.success, outcomes.strict))
-    return TerrainResult(types, env.skills, level, success, strict)
+    shares = {
+        kind: getattr(outcomes, kind).float().mean(dim=-1).cpu()
+        for kind in ("success", "feet_only", "strict")
+    }
+    return TerrainResult(types, env.skills, level, **shares)
 
 
 def cross(

@@ -66,6 +66,7 @@ class SelfImitation:
         self.selector = PremiumSelector(config.premium, keyframe_features, num_envs, num_steps)
         self._pairs = torch.zeros(num_steps, num_envs, 2 * features, device=device)
         self._valid = torch.zeros(num_steps, num_envs, dtype=torch.bool, device=device)
+        self._earned = torch.zeros(num_steps, num_envs, device=device)
         self._skill = torch.zeros(num_steps * num_envs, dtype=torch.int64, device=device)
         self._rewards = torch.zeros(num_steps, num_envs, device=device)
         self._train = Recorded(
@@ -127,22 +128,37 @@ class SelfImitation:
         failed = dones.bool() & ~time_outs
         command, velocity = before[names.COMMAND][:, :2], before[names.VELOCITY][:, :2]
         speed = torch.linalg.vector_norm(command, dim=-1)
+        progress = (velocity * command).sum(dim=-1) / speed.clamp(min=1e-6)
+        storage.write_row(self._earned, self._share_earned(speed, progress))
         self.selector.record(
             features=after,
             skill=before[names.SKILL].argmax(dim=-1),
             reward=rewards,
             speed=speed,
-            progress=(velocity * command).sum(dim=-1) / speed.clamp(min=1e-6),
+            progress=progress,
             done=dones.bool(),
             valid=valid & ~failed,
         )
+
+    def _share_earned(self, speed: torch.Tensor, progress: torch.Tensor) -> torch.Tensor:
+        """Return the share of the imitation reward that robots get for how they follow, (N,).
+
+        Args:
+            speed: Commanded, (N,), m/s.
+            progress: Velocity along the command, (N,), m/s.
+        """
+        whole = self.config.whole_from * speed
+        share = (progress / whole.clamp(min=1e-6)).clamp(0.0, 1.0)
+        moves = (speed >= self.config.premium.min_command) & (whole > 0.0)
+        return torch.where(moves, share, 1.0)
 
     @torch.no_grad()
     def rewards(self) -> torch.Tensor:
         """Return the imitation reward of every step of the rollout, (T, N)."""
         score = apply(lambda pairs: self.discriminator(pairs), {"pairs": self._pairs.flatten(0, 1)})
         score = score.view_as(self._valid)
-        self._rewards = self.config.reward_weight * imitation_reward(score) * self._valid
+        earned = self._valid * self._earned
+        self._rewards = self.config.reward_weight * imitation_reward(score) * earned
         return self._rewards
 
     def update(

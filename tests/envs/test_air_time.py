@@ -11,7 +11,7 @@ ALONE = [
     *(f"env.rewards.terms.{name}=null" for name in load_config("solo8").env.rewards.terms),
     f"env.rewards.terms.feet_air_time={{weight: 1.0, target: {TARGET}}}",
     "env.commands.zero_probability=0",
-    "env.commands.least_lin_vel_x=0.2",  # nobody is asked to stand
+    "env.commands.lin_vel_x=[0.2,0.6]",  # nobody is asked to stand
     "env.terminations.episode_length=0.5",
 ]
 

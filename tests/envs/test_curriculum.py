@@ -1,4 +1,4 @@
-"""Levels go up for who crosses, down for who falls or is stuck, each skill on its own."""
+"""Levels follow success: half of the episodes at the frontier of a skill on a type of terrain."""
 
 from __future__ import annotations
 
@@ -24,10 +24,15 @@ def library():
     return build_library(dataclasses.replace(config, levels=3, variants=2))
 
 
+def make(library, worlds=WORLDS, seed=0):
+    random = UniformBuffer(worlds, COLUMNS, torch.Generator().manual_seed(seed))
+    random.refill()
+    return Curriculum(library, SKILLS, random)
+
+
 @pytest.fixture
 def curriculum(library):
-    random = UniformBuffer(WORLDS, COLUMNS, torch.Generator().manual_seed(0))
-    return Curriculum(library, SKILLS, random, start_level=0)
+    return make(library)
 
 
 def flags(*worlds):
@@ -49,99 +54,136 @@ def walk(curriculum, seconds, command, velocity):
         curriculum.record(task, robot, dt=1.0)
 
 
+def end(curriculum, worlds, *, fallen=(), crossed=(), skill=0, times=1):
+    """End episodes of some worlds, each of them several times."""
+    for _ in range(times):
+        curriculum.update(flags(*worlds), flags(*fallen), flags(*crossed), skills(skill))
+
+
 def test_types_are_dealt_by_their_proportions(curriculum, library):
     names = [library.types[k] for k in curriculum.kind.tolist()]
-    assert names == ["flat", *2 * ["slopes"], *2 * ["bars"], *2 * ["footholds"], *3 * ["stairs"]]
+    assert names == [
+        "flat", "slopes", "slopes", "bars", "bars", "footholds", "footholds",
+        "stairs_up", "stairs_up", "stairs_down",
+    ]  # fmt: skip
 
 
-def test_the_first_levels_are_drawn_up_to_the_start_level(library):
-    random = UniformBuffer(200, COLUMNS, torch.Generator().manual_seed(0))
-    level = Curriculum(library, SKILLS, random, start_level=1).level
-    assert level.unique().tolist() == [0, 1]
-    assert level.float().mean(dim=0).tolist() == pytest.approx([0.5] * SKILLS, abs=0.1)
+def test_every_skill_begins_at_the_lowest_level_of_every_type(curriculum, library):
+    assert curriculum.frontier.tolist() == [[0] * SKILLS] * len(library.types)
+    assert curriculum.level.tolist() == [0] * WORLDS
 
 
-def test_crossing_promotes_the_skill_that_did_it(curriculum):
-    curriculum.update(flags(1, 2), flags(), flags(1), skills(2))
-    assert curriculum.level[1].tolist() == [0, 0, 1]
-    assert curriculum.level.sum() == 1
+def test_enough_crossings_move_the_frontier_of_that_skill_and_type_alone(curriculum, library):
+    end(curriculum, [3], crossed=[3], skill=2, times=20)
+    bars = library.types.index("bars")
+    assert curriculum.frontier[bars].tolist() == [0, 0, 1]
+    assert curriculum.frontier.sum() == 1
 
 
-def test_a_fall_demotes_to_the_lowest_level_at_most(curriculum):
-    curriculum.level[:] = 1
-    for _ in range(2):
-        curriculum.update(flags(4), flags(4), flags(), skills(1))
-    assert curriculum.level[4].tolist() == [1, 0, 1]
+def test_a_few_crossings_are_not_enough(curriculum):
+    end(curriculum, [3], crossed=[3], times=4)
+    assert curriculum.frontier.sum() == 0
+
+
+def test_who_falls_too_often_does_not_move_on(curriculum):
+    for _ in range(20):  # two of three succeed
+        end(curriculum, [3], crossed=[3], times=2)
+        end(curriculum, [3], fallen=[3], crossed=[3])
+    assert curriculum.frontier.sum() == 0
+
+
+def test_a_skill_that_is_lost_comes_back_to_where_it_fails(curriculum, library):
+    bars = library.types.index("bars")
+    end(curriculum, [3], crossed=[3], times=30)
+    assert curriculum.frontier[bars, 0] == 1
+    end(curriculum, [3], fallen=[3], times=10)
+    assert curriculum.frontier[bars, 0] == 0
 
 
 @pytest.mark.parametrize(
-    ("command", "velocity", "level"),
+    ("command", "velocity", "success"),
     [
-        ((0.3, 0.0, 0.0), (0.14, 0.0, 0.0), 0),  # 1.4 m of 3 m: stuck
-        ((0.3, 0.0, 0.0), (0.16, 0.0, 0.0), 1),  # more than half of the way
+        ((0.3, 0.0, 0.0), (0.20, 0.0, 0.0), 0),  # 2 m of 3 m
+        ((0.3, 0.0, 0.0), (0.24, 0.0, 0.0), 1),  # more than three quarters
         ((-0.3, 0.0, 0.6), (-0.3, 0.0, 0.0), 1),  # backwards, and in a circle
         ((-0.3, 0.0, 0.0), (0.3, 0.0, 0.0), 0),  # the wrong way
-        ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 1),  # told to stand
-        ((0.0, 0.0, 0.6), (0.0, 0.0, 0.0), 1),  # told to turn
-        ((0.09, 0.0, 0.0), (0.0, 0.0, 0.0), 1),  # 0.9 m: too little to judge
+        ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), None),  # told to stand
+        ((0.0, 0.0, 0.6), (0.0, 0.0, 0.0), None),  # told to turn
+        ((0.09, 0.0, 0.0), (0.0, 0.0, 0.0), None),  # 0.9 m: too little to judge
+        ((0.15, 0.0, 0.0), (0.15, 0.0, 0.0), 0),  # all of 1.5 m, which is no way to speak of
     ],
 )
-def test_who_makes_less_than_half_of_the_way_is_demoted(curriculum, command, velocity, level):
-    curriculum.level[:] = 1
+def test_a_trial_is_judged_by_the_share_of_the_commanded_way(
+    curriculum, command, velocity, success
+):
     walk(curriculum, 10, command, velocity)
-    curriculum.update(flags(7), flags(), flags(), skills())
-    assert curriculum.level[7, 0] == level
+    end(curriculum, [7])
+    log = curriculum.describe(("walk", "crawl", "stilt"))
+    tries = curriculum.state_dict()["_tries"].sum()
+    assert tries == (success is not None)
+    assert log["Terrain/success_level_0"] == (success or 0)
 
 
 def test_the_way_of_an_episode_begins_at_its_reset(curriculum):
-    curriculum.level[:] = 1
     walk(curriculum, 10, (0.3, 0.0, 0.0), (0.02, 0.0, 0.0))
-    curriculum.update(flags(7), flags(), flags(), skills())
+    end(curriculum, [7])
     walk(curriculum, 10, (0.3, 0.0, 0.0), (0.3, 0.0, 0.0))
-    curriculum.update(flags(7, 8), flags(), flags(), skills())
-    assert curriculum.level[7, 0] == 0  # as the first episode left it
-    assert curriculum.level[8, 0] == 1  # more than half of its way, over both stretches
+    end(curriculum, [7])
+    log = curriculum.describe(("walk", "crawl", "stilt"))
+    assert log["Terrain/success_level_0"] == pytest.approx(1 / 1.95)  # the older one has faded
 
 
 def test_episodes_in_which_the_skill_changed_do_not_count(curriculum):
     curriculum.keep_counting(~flags(3))
-    curriculum.update(flags(3, 4), flags(), flags(3, 4), skills())
-    assert curriculum.level[:, 0].tolist() == [0, 0, 0, 0, 1, 0, 0, 0, 0, 0]
-    curriculum.update(flags(3), flags(), flags(3), skills())  # the next episode does
-    assert curriculum.level[3, 0] == 1
+    end(curriculum, [3], crossed=[3])
+    assert curriculum.state_dict()["_tries"].sum() == 0
+    end(curriculum, [3], crossed=[3])  # the next episode does
+    assert curriculum.state_dict()["_tries"].sum() == 1
 
 
-def test_beyond_the_top_any_level_is_drawn(curriculum):
+def test_half_of_the_episodes_begin_at_the_frontier(library):
+    curriculum = make(library, worlds=3000)
+    tries = curriculum.state_dict()["_tries"]
+    tries[:, :, :2] = 20.0  # levels 0 and 1 of 3 are left behind
+    curriculum.state_dict()["_successes"][:] = tries
+    everyone = torch.ones(3000, dtype=torch.bool)
+    curriculum.begin(everyone, torch.zeros(3000, dtype=torch.int64))
+    assert (curriculum.frontier == 2).all()
+    shares = torch.bincount(curriculum.level, minlength=3) / 3000
+    # A half at the frontier; the other half anywhere, which is at the top the same as up to it.
+    torch.testing.assert_close(shares, torch.tensor([1 / 6, 1 / 6, 2 / 3]), atol=0.03, rtol=0)
+
+
+def test_running_episodes_keep_their_level(library):
+    curriculum = make(library)
     curriculum.level[:] = 2
-    everyone = torch.ones(WORLDS, dtype=torch.bool)
-    curriculum.update(everyone, ~everyone, everyone, skills())
-    assert set(curriculum.level[:, 0].tolist()) == {0, 1, 2}
-    assert (curriculum.level[:, 1:] == 2).all()
+    curriculum.begin(flags(4), skills())
+    assert curriculum.level[[0, 1, 2, 3, 5]].tolist() == [2] * 5
 
 
-def test_tiles_are_of_the_world_s_type_and_the_skill_s_level(curriculum, library):
-    curriculum.level[:] = torch.tensor([0, 1, 2])
-    tile = curriculum.tiles(skills(2))
+def test_tiles_are_of_the_world_s_type_and_level(curriculum, library):
+    curriculum.level[:] = 2
+    tile = curriculum.tiles()
     assert torch.equal(tile // (library.levels * library.variants), curriculum.kind)
     assert set((tile // library.variants % library.levels).tolist()) == {2}
     assert set((tile % library.variants).tolist()) == {0, 1}
 
 
-def test_levels_and_successes_are_described(curriculum):
-    curriculum.level[9] = torch.tensor([2, 1, 0])  # stairs, one world of three
+def test_frontiers_and_successes_are_described(curriculum):
+    end(curriculum, [3], crossed=[3], skill=0, times=20)
     log = curriculum.describe(("walk", "crawl", "stilt"))
-    assert log["Terrain/level_stairs"] == pytest.approx(1 / 3)
-    assert log["Terrain/level_walk"] == pytest.approx(2 / 9)  # over the nine rough worlds
-    curriculum.update(flags(0, 5, 6), flags(6), flags(0, 5), skills(1))
-    log = curriculum.describe(("walk", "crawl", "stilt"))
-    assert log["Terrain/success_level_0"] == pytest.approx(1 / 2)  # flat ground does not count
+    assert log["Terrain/level_bars"] == pytest.approx(1 / 3)
+    rough = sum(kind != "flat" for kind in curriculum._library.types)
+    assert log["Terrain/level_walk"] == pytest.approx(1 / rough)
+    end(curriculum, [0], fallen=[0])
+    again = curriculum.describe(("walk", "crawl", "stilt"))
+    assert again["Terrain/success_level_0"] == 1.0  # flat ground does not count
 
 
 def test_a_saved_curriculum_goes_on(curriculum, library):
     walk(curriculum, 3, (0.3, 0.0, 0.0), (0.1, 0.0, 0.0))
-    curriculum.update(flags(1), flags(), flags(1), skills())
-    random = UniformBuffer(WORLDS, COLUMNS, torch.Generator().manual_seed(1))
-    other = Curriculum(library, SKILLS, random, start_level=2)
+    end(curriculum, [1], crossed=[1])
+    other = make(library, seed=1)
     other.load_state_dict(curriculum.state_dict())
     for name, value in curriculum.state_dict().items():
         assert torch.equal(other.state_dict()[name], value), name

@@ -30,7 +30,7 @@ def library():
 @pytest.fixture(scope="session")
 def tiles(library):
     """Four tiles with platforms of four heights: bars 0, plates 0.15, slopes 1.96, stairs 0.22."""
-    names = ["bars", "footholds", "slopes", "stairs"]
+    names = ["bars", "footholds", "slopes", "stairs_down"]
     levels, variants = [1, 1, 1, 0], [0, 0, 1, 1]
     return torch.tensor(
         [

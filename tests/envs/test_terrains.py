@@ -53,11 +53,11 @@ def ring_tops(library, tile, x, y):
 
 
 def test_stairs_lead_up_or_down():
-    up = terrains.stairs(draw(1.0), riser=[0.02, 0.12], tread=0.3)
+    up = terrains.stairs_up(draw(1.0), riser=[0.02, 0.12], tread=0.3)
     np.testing.assert_allclose(up.edges[:3], [0.6, 0.9, 1.2])
     np.testing.assert_allclose(up.tops[:3, 0], [0.0, 0.12, 0.24])
     assert up.edges[-1] == 4.0
-    down = terrains.stairs(draw(1.0, inverted=True), riser=[0.02, 0.12], tread=0.3)
+    down = terrains.stairs_down(draw(1.0), riser=[0.02, 0.12], tread=0.3)
     np.testing.assert_allclose(down.tops[:, 0], up.tops[::-1, 0])
 
 
@@ -91,9 +91,40 @@ def test_footholds_are_plates_between_moats():
     assert (tile.tops[1::2] == 0).all()
 
 
+def test_pits_are_wide_trenches_in_a_plateau():
+    tile = terrains.pits(draw(1.0), depth=[0.01, 0.12], width=0.5, spacing=1.1)
+    np.testing.assert_allclose(tile.edges[:3], [0.6, 1.1, 1.7])  # platform, trench, plateau
+    np.testing.assert_allclose(tile.tops[:3, 0], [0.12, 0.0, 0.12])
+
+
+def test_plates_lie_side_by_side_in_no_order():
+    tile = terrains.plates(draw(1.0), height=[0.02, 0.2], width=0.4)
+    np.testing.assert_allclose(np.diff(tile.edges), 0.4)
+    assert (tile.tops[0] == 0.1).all()
+    assert (tile.tops >= 0).all() and (tile.tops <= 0.2).all() and np.ptp(tile.tops[1:]) > 0.1
+
+
+def test_ramps_go_up_and_down_in_turn():
+    tile = terrains.ramps(draw(1.0), angle=[0.0, 45.0], length=0.5)
+    x = np.array([0.6, 0.85, 1.1, 1.6, 2.1])
+    np.testing.assert_allclose(tile.ground(x, 0 * x), [0.0, 0.25, 0.5, 0.0, 0.5], atol=1e-9)
+
+
+def test_rough_ground_differs_from_point_to_point_and_spares_the_platform():
+    tile = terrains.rough(draw(1.0), height=[0.01, 0.08])
+    axis = np.linspace(-4.0, 4.0, 81)
+    x, y = np.meshgrid(axis, axis)
+    height = tile.ground(x, y)
+    platform = np.maximum(abs(x), abs(y)) <= 0.61
+    assert (height[platform] == 0).all()
+    outside = np.maximum(abs(x), abs(y)) > 0.75
+    assert height[outside].mean() == pytest.approx(0.04, abs=0.002)
+    assert height[outside].max() <= 0.08
+
+
 def test_a_larger_robot_meets_larger_obstacles():
-    small = terrains.stairs(draw(0.0, scale=1.0), riser=0.1, tread=0.3)
-    large = terrains.stairs(draw(0.0, scale=1.5), riser=0.1, tread=0.3)
+    small = terrains.stairs_up(draw(0.0, scale=1.0), riser=0.1, tread=0.3)
+    large = terrains.stairs_up(draw(0.0, scale=1.5), riser=0.1, tread=0.3)
     np.testing.assert_allclose(large.edges[:2], [0.6, 1.05])  # the platform stays
     np.testing.assert_allclose(large.tops[1], 1.5 * small.tops[1])
 
@@ -142,13 +173,13 @@ def test_bumps_stick_out_of_rings_and_never_soften_an_edge(library):
     x, y = points[0].double().numpy().T
     for tile in range(library.size):
         kind, level = divmod(tile // library.variants, library.levels)
-        if library.types[kind] == "slopes":
+        if library.types[kind] in ("slopes", "ramps", "rough"):
             continue
         bump = heights[tile] - ring_tops(library, tile, x, y)
-        highest = 0.0 if library.types[kind] == "flat" else 0.02 + 0.05 * level / 9
+        highest = 0.0 if library.types[kind] == "flat" else 0.04 * level / 9
         assert bump.min() > -1e-6
         assert bump.max() < highest + 1e-6
-        if library.types[kind] in ("bars", "stairs"):
+        if library.types[kind] in ("bars", "stairs_up", "stairs_down", "pits", "plates"):
             assert bump.max() > 0.7 * highest
 
 
@@ -213,7 +244,7 @@ def test_heights_are_those_that_rays_see(library, rays, kind):
 
 def test_worlds_have_their_own_tiles(library):
     ground = Ground(library, 3, torch.device("cpu"))
-    stairs = library.index(library.types.index("stairs"), 9, 1)
+    stairs = library.index(library.types.index("stairs_up"), 9, 1)
     ground.write(torch.tensor([False, True, False]), torch.full((3,), stairs))
     assert ground.tile.tolist() == [0, stairs, 0]
     centre = ground.heights(torch.zeros(3, 1, 2))[:, 0]
@@ -234,7 +265,7 @@ def test_a_position_that_is_not_a_number_is_harmless(library):
 @pytest.mark.parametrize(
     ("name", "values", "message"),
     [
-        ("stairz", {"proportion": 1.0}, "no term 'stairz': did you mean 'stairs'?"),
+        ("stairs_upp", {"proportion": 1.0}, "no term 'stairs_upp': did you mean 'stairs_up'?"),
         ("flat", {}, "types.flat: no proportion; it takes proportion"),
         ("flat", 0.1, "types.flat: give a proportion, as in flat: {proportion: 0.2}"),
         ("flat", {"proportion": 0.1, "up": 1}, "unknown parameter 'up'; it takes proportion"),
@@ -243,8 +274,16 @@ def test_a_position_that_is_not_a_number_is_harmless(library):
         ("slopes", {"angle": "steep"}, "give one number or [lowest level, top level], not 'steep'"),
         ("slopes", {"angle": [1, 2, 3]}, "give one number or [lowest level, top level], not [1,"),
         ("slopes", {"angle": -5}, "slopes: an angle of -5 degrees; allowed are 0 to 60"),
-        ("stairs", {"tread": 0, "riser": 0.1}, "stairs: 0 m is not a length: it has to be posi"),
-        ("stairs", {"tread": 0.1, "riser": 0.1}, "stairs: 136 boxes a tile, 48 are allowed: put"),
+        (
+            "stairs_up",
+            {"tread": 0, "riser": 0.1},
+            "stairs_up: 0 m is not a length: it has to be posi",
+        ),
+        (
+            "stairs_up",
+            {"tread": 0.1, "riser": 0.1},
+            "stairs_up: 136 boxes a tile, 48 are allowed: put",
+        ),
         ("bars", {"height": 0.1, "width": 0.7, "spacing": 0.5}, "bars: its rings overlap"),
     ],
 )

@@ -176,7 +176,17 @@ def test_contacts_err_less_the_longer_they_are_searched(bench, monkeypatch, tmp_
 
 
 def test_contacts_need_a_height_field(capsys):
-    rough = ("slopes", "bars", "footholds", "stairs")
+    rough = (
+        "slopes",
+        "bars",
+        "footholds",
+        "stairs_up",
+        "stairs_down",
+        "pits",
+        "plates",
+        "ramps",
+        "rough",
+    )
     without = [f"finetuning.env.terrain.types.{name}=null" for name in rough]
     assert main([*SMALL, "--parts=contacts", *without]) == 2
     assert "height field" in capsys.readouterr().err

@@ -30,7 +30,9 @@ from kiras_rl.tools.evaluator import evaluation_physics, make_evaluation_env, on
 
 FORWARD = ((0.1, 0.5), (0.0, 0.0), (-0.2, 0.2))
 ROBOT = load_robot("solo8")
-ROUGH = ("slopes", "bars", "footholds", "stairs")
+ROUGH = (
+    "slopes", "bars", "footholds", "stairs_up", "stairs_down", "pits", "plates", "ramps", "rough"
+)  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -285,7 +287,7 @@ def test_the_command_writes_a_dataset_that_says_where_it_is_from(policy_file, tm
 
 def test_on_terrain_heights_are_above_the_ground_and_headings_held(policy_file, tmp_path):
     line = [str(policy_file), "--skills=walk", "--episodes=4", "--duration=0.5", "--nominal"]
-    assert main([*line, "--terrain=stairs:1", f"--out={tmp_path / 'a'}"]) == 0
+    assert main([*line, "--terrain=stairs_up:1", f"--out={tmp_path / 'a'}"]) == 0
     dataset = load_dataset(tmp_path / "a")
     above, level = dataset["base_height"][:, 0], dataset["base_pos_w"][:, 2]
     assert np.abs(level - above).max() > 0.01
@@ -331,8 +333,8 @@ def test_mistakes_are_one_line_and_leave_nothing(error_of, nameless_file, tmp_pa
     assert "holds none of policy.onnx, checkpoints/" in error_of(policy=tmp_path / "run")
     assert "unknown skill 'trot' in --skills; this policy has: walk" in error_of("--skills=trot")
     assert "no terrain 'sand'; there are: flat, " in error_of("--terrain=sand")
-    assert "no terrain level 2; it goes from 0 to 1" in error_of("--terrain=stairs:2")
-    assert "give TYPE[:LEVEL]" in error_of("--terrain=stairs:1:1")
+    assert "no terrain level 2; it goes from 0 to 1" in error_of("--terrain=stairs_up:2")
+    assert "give TYPE[:LEVEL]" in error_of("--terrain=stairs_up:1:1")
     assert "provenance.config is missing" in error_of(policy=nameless_file)
     assert not (tmp_path / "out").exists()
 

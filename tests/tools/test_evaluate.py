@@ -75,7 +75,17 @@ def test_terrain_is_crossed_level_by_level_and_gives_the_same_numbers_again(
     found = results(tmp_path / "a", "terrain")
     assert len(found) == 2
     for types in found.values():
-        assert list(types) == ["slopes", "bars", "footholds", "stairs"]
+        assert list(types) == [
+            "slopes",
+            "bars",
+            "footholds",
+            "stairs_up",
+            "stairs_down",
+            "pits",
+            "plates",
+            "ramps",
+            "rough",
+        ]
         for cells in types.values():
             assert list(cells) == SKILLS
             assert all(0 <= c["strict"] <= c["success"] <= c["trials"] == 1 for c in cells.values())
@@ -103,7 +113,7 @@ def test_transitions_are_measured_on_both_grounds(tmp_path, monkeypatch):
     assert flat["settled"][0][1] == 1.0 and flat["settled"][0][0] is None
     trace = next(value for key, value in found.items() if "/trace" in key)
     assert trace["order"] == [*SKILLS, "walk"]
-    # 20 trials: every variant of the four rough types, stairs up and stairs down
+    # 20 trials: every variant of the rough types
     assert set(tiles) == {(kind, 3, variant) for kind in (1, 2, 3, 4) for variant in range(4)}
     assert trace["height"]["mean"][70] == pytest.approx(0.2, abs=0.02)  # of walking, at 1.4 s
     assert trace["height"]["mean"][145] == pytest.approx(0.1, abs=0.02)  # of crawling

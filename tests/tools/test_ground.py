@@ -20,7 +20,10 @@ from kiras_rl.tools.policy_files import load_policy
 from kiras_rl.tools.script import Segment, record
 from kiras_rl.tools.summary import summarize
 
-KINDS = ("flat", "slopes", "bars", "footholds", "stairs")
+KINDS = (
+    "flat", "slopes", "bars", "footholds", "stairs_up", "stairs_down",
+    "pits", "plates", "ramps", "rough",
+)  # fmt: skip
 RISER = 0.12  # m, at the top level
 UP, DOWN = 0, 1  # variants
 
@@ -42,25 +45,28 @@ def drive(policy_file, terrain, *tile):
 
 def test_a_tile_is_read(terrain):
     assert terrain.kinds == KINDS
-    assert terrain.parse("stairs:4:1") == Tile("stairs", 4, 1)
+    assert terrain.parse("stairs_up:4:1") == Tile("stairs_up", 4, 1)
     assert terrain.parse("slopes:9") == Tile("slopes", 9, 0)
     assert terrain.parse("bars") == Tile("bars", 0, 0)
     assert terrain.parse("flat").is_flat
-    assert str(Tile("stairs", 4, 1)) == "stairs:4:1"
+    assert str(Tile("stairs_up", 4, 1)) == "stairs_up:4:1"
 
 
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("stair", "no terrain 'stair'; there are: flat, slopes, bars, footholds, stairs"),
-        ("stairs:10", "no terrain level 10; it goes from 0 to 9"),
-        ("stairs:0:4", "no terrain variant 4; it goes from 0 to 3"),
-        ("stairs:-1", "not 'stairs:-1'; types: flat, slopes, .*; levels 0 to 9, variants 0 to 3"),
+        ("stair", "no terrain 'stair'; there are: flat, slopes, bars, footholds, stairs_up"),
+        ("stairs_up:10", "no terrain level 10; it goes from 0 to 9"),
+        ("stairs_up:0:4", "no terrain variant 4; it goes from 0 to 3"),
         (
-            "stairs:high",
-            r"a terrain is TYPE\[:LEVEL\[:VARIANT\]\], e.g. stairs:4, not 'stairs:high'",
+            "stairs_up:-1",
+            "not 'stairs_up:-1'; types: flat, slopes, .*; levels 0 to 9, variants 0 to 3",
         ),
-        ("stairs:1:1:1", "not 'stairs:1:1:1'"),
+        (
+            "stairs_up:high",
+            r"a terrain is TYPE\[:LEVEL\[:VARIANT\]\], e.g. stairs_up:4, not 'stairs_up:high'",
+        ),
+        ("stairs_up:1:1:1", "not 'stairs_up:1:1:1'"),
     ],
 )
 def test_a_tile_that_cannot_be_is_named_with_those_that_can(terrain, text, message):
@@ -90,12 +96,12 @@ def test_a_run_that_cannot_be_read_still_drives(make_metadata):
 def test_flat_ground_is_there_even_if_a_run_had_none(terrain):
     types = terrain.config.types | {"flat": None, "bars": None}
     other = Terrain(dataclasses.replace(terrain.config, types=types))
-    assert other.kinds == ("flat", "slopes", "footholds", "stairs")
+    assert other.kinds == tuple(kind for kind in KINDS if kind != "bars")
 
 
 def test_of_another_terrain_the_nearest_tile_is_taken(terrain):
     small = Terrain(dataclasses.replace(terrain.config, levels=3, variants=1))
-    assert small.nearest(Tile("stairs", 7, 2)) == Tile("stairs", 2, 0)
+    assert small.nearest(Tile("stairs_up", 7, 2)) == Tile("stairs_up", 2, 0)
     assert small.nearest(Tile("ice", 1, 0)).is_flat
 
 
@@ -122,7 +128,7 @@ def test_heights_are_those_of_training(still_file, terrain, kind, variant):
 
 def test_the_base_is_measured_from_the_ground_under_it(still_file, smooth_terrain):
     """1.5 to 1.8 m from the middle is the fourth step."""
-    driver = drive(still_file, smooth_terrain, "stairs", 9, UP)
+    driver = drive(still_file, smooth_terrain, "stairs_up", 9)
     driver.data.qpos[:3] = (1.65, 0.0, 4 * RISER + 1.0)
     assert driver.step().base_height == pytest.approx(1.0, abs=0.01)
     assert driver.data.qpos[2] == pytest.approx(4 * RISER + 1.0, abs=0.01)
@@ -130,7 +136,7 @@ def test_the_base_is_measured_from_the_ground_under_it(still_file, smooth_terrai
 
 def test_at_an_edge_it_is_measured_from_the_mean_of_nine_points(still_file, smooth_terrain):
     """Three of nine points at 1.72 + 0.1 m are on the fifth step."""
-    driver = drive(still_file, smooth_terrain, "stairs", 9, UP)
+    driver = drive(still_file, smooth_terrain, "stairs_up", 9)
     driver.data.qpos[:3] = (1.72, 0.0, 2.0)
     assert driver.ground_height((1.72, 0.0)) == pytest.approx((4 + 1 / 3) * RISER)
 
@@ -152,13 +158,13 @@ def test_it_stands_on_every_platform_in_its_keyframe(policy, terrain, kind, vari
 
 def test_on_a_tile_the_feet_begin_just_above_the_platform(still_file, smooth_terrain):
     """Down from the middle: eleven steps of 0.3 m between 0.6 and 4 m."""
-    driver = drive(still_file, smooth_terrain, "stairs", 9, DOWN)
+    driver = drive(still_file, smooth_terrain, "stairs_down", 9)
     feet = [driver.data.geom(name).xpos[2] for name in driver.robot.foot_geoms]
     assert min(feet) == pytest.approx(11 * RISER + 0.016 + 0.002, abs=1e-6)
 
 
 def test_the_end_of_a_tile_is_crossed_and_not_a_fall(still_file, terrain):
-    driver = drive(still_file, terrain, "stairs", 0, DOWN)
+    driver = drive(still_file, terrain, "stairs_down", 0)
     for place, crossed in (((3.69, 0), False), ((3.71, 0), True), ((0, -3.71), True)):
         driver.data.qpos[:2] = place
         driver.data.qpos[2] = 1.0
@@ -201,7 +207,7 @@ def trajectory(driver):
 def test_on_flat_ground_terrain_changes_nothing(exported, terrain):
     plain = Driver(OnboardPolicy(exported[2]))
     assert plain.model.ngeom == load_robot("solo8").spec().compile().ngeom
-    back = drive(exported[2], terrain, "stairs", 9, DOWN)
+    back = drive(exported[2], terrain, "stairs_down", 9)
     back.show("flat")
     np.testing.assert_array_equal(trajectory(plain), trajectory(back))
 
@@ -222,10 +228,10 @@ def test_the_height_field_is_solid(still_file, terrain):
 
 
 def test_a_tile_that_is_not_there_leaves_the_robot_where_it_is(still_file, terrain):
-    driver = drive(still_file, terrain, "stairs", 2)
+    driver = drive(still_file, terrain, "stairs_up", 2)
     model = driver.model
     with pytest.raises(ConfigError, match="no terrain 'ice'"):
         driver.show("ice")
     assert driver.model is model
-    assert driver.tile == Tile("stairs", 2)
+    assert driver.tile == Tile("stairs_up", 2)
     assert Driver(OnboardPolicy(still_file)).tile == FLAT

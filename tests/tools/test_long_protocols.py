@@ -109,30 +109,34 @@ def check_obstacles(folder):
         assert list(table) == rows
         for row in table.values():
             assert list(row) == ["size", *SKILLS]
-            assert {row[skill] for skill in SKILLS} <= {"0 (0)", "100 (0)", "100 (100)"}
+            for skill in SKILLS:
+                success, feet_only, strict = map(int, row[skill].split(" / "))
+                assert max(feet_only, strict) <= success <= 100
     assert read(folder, "obstacles_the_paper_s_hardware")["stairs up, 15 cm"]["walk [%]"] == "80.0"
 
 
 def check_heat_map(folder):
     measured = results(folder)
-    for table, kind, level in (
-        ("s_steps_of_6_0_cm", "stairs", 4),
-        ("d_gaps_of_8_0_cm", "footholds", 5),
+    for table, kind, size in (
+        ("s_up_steps_up_of_6_cm", "stairs_up", 6),
+        ("s_down_steps_down_of_6_cm", "stairs_down", 6),
+        ("d_gaps_of_8_cm", "footholds", 8),
     ):
-        (cells,) = (v for k, v in measured.items() if f"type={kind} level={level} " in k)
+        (cells,) = (v for k, v in measured.items() if f"type={kind} cm={size} " in k)
         rows = read(folder, f"heat_map_{table}")
         assert list(rows) == [*SKILLS, "all"]
         for skill, counts in cells.items():
             assert rows[skill]["trials"] == "1"
-            for shown in ("success", "strict", "kept"):
-                assert rows[skill][f"{shown} [%]"].startswith(f"{100 * counts[shown]} [")
+            for shown in ("success", "feet_only", "strict", "kept"):
+                column = shown.replace("_", " ")
+                assert rows[skill][f"{column} [%]"].startswith(f"{100 * counts[shown]} [")
                 assert counts[shown] <= counts["success"]
             assert float(rows[skill]["falls [%]"]) == 100 * counts["fell"]
         assert rows["all"]["trials"] == "5"
     page = (folder / "report.html").read_text()
-    assert all(f"Heat map: {kind}" in page for kind in ("success", "strict", "kept"))
-    others = [*(f"steps of {x} cm" for x in ("4.0", "8.0", "10.0"))]
-    others += [f"gaps of {x} cm" for x in ("5.6", "9.6", "12.0")]
+    assert all(f"Heat map: {kind}" in page for kind in ("success", "feet_only", "kept"))
+    others = [f"steps {way} of {x} cm" for way in ("up", "down") for x in (4, 8, 10, 12)]
+    others += ["bars of 6 cm", *(f"gaps of {x} cm" for x in (4, 6, 10))]
     assert list(read(folder, "heat_map_other_sizes_solo8_flat")) == others
 
 

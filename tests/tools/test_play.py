@@ -48,10 +48,18 @@ def test_a_table_of_every_skill_is_printed(still_file, capsys):
 
 def test_a_script_is_driven_on_terrain(still_file, tmp_path, capsys):
     path = tmp_path / "trace.npz"
-    arguments = [str(still_file), SHORT, "--terrain", "stairs:4:1", "--table", "--trace", str(path)]
+    arguments = [
+        str(still_file),
+        SHORT,
+        "--terrain",
+        "stairs_up:4:1",
+        "--table",
+        "--trace",
+        str(path),
+    ]
     assert main(arguments) == 0
     out = capsys.readouterr().out
-    assert "solo8 on stairs:4:1, 0.8 s" in out
+    assert "solo8 on stairs_up:4:1, 0.8 s" in out
     assert "crossed" in out
     trace = np.load(path)
     assert trace["qpos"][0, 2] > trace["base_height"][0] + 0.5  # on a platform of eleven steps
@@ -141,7 +149,7 @@ def error_of(capsys):
             ["--terrain", "ice"],
             "no terrain 'ice'; there are: flat, slopes, bars, footholds, stairs",
         ),
-        (["--terrain", "stairs:12", "--table"], "no terrain level 12; it goes from 0 to 9"),
+        (["--terrain", "stairs_up:12", "--table"], "no terrain level 12; it goes from 0 to 9"),
         (["--robot", "go1"], "--robot go1 was given, but"),
         (["--follow"], "only a run can be followed, such as runs/solo8/<time>, not "),
         (["--host", "999.1.1.1"], "cannot listen on --host 999.1.1.1"),

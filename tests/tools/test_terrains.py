@@ -69,6 +69,17 @@ def test_budgets_suffice(capsys):
     assert terrains.main(["solo8", "--budgets", *SMALL]) == 0
     rows = [line.split() for line in capsys.readouterr().out.splitlines()]
     needs = {row[0]: [float(x) for x in row[1:]] for row in rows if len(row) == 4}
-    for kind in ("flat", "slopes", "bars", "footholds", "stairs"):
+    for kind in (
+        "flat",
+        "slopes",
+        "bars",
+        "footholds",
+        "stairs_up",
+        "stairs_down",
+        "pits",
+        "plates",
+        "ramps",
+        "rough",
+    ):
         contacts, constraints, overflows = needs[kind]
         assert contacts < 32 and constraints < 256 and overflows == 0

@@ -12,6 +12,11 @@ from kiras_rl.tools.protocols.subject import Subject
 SPEEDS = (0.2, 0.6)
 """Commanded v_x, m/s: spread evenly over the trials of a cell."""
 
+KINDS = ("success", "feet_only", "strict")
+"""Of what a cell of a table gives the shares."""
+
+KINDS_NOTE = "Success / on feet only / strict, in %."
+
 Z = 1.959963984540054
 """Standard normal quantile of a two-sided 95 % interval."""
 
@@ -45,6 +50,11 @@ def count(
 def share(counts: dict, kind: str) -> float:
     """Return the share of successes of a kind."""
     return counts[kind] / counts["trials"]
+
+
+def shares(counts: dict) -> str:
+    """Return the shares of KINDS in %, as in `95 / 90 / 41`."""
+    return " / ".join(f"{100 * share(counts, kind):.0f}" for kind in KINDS)
 
 
 def pooled(cells: dict[str, dict]) -> dict:

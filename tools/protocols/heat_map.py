@@ -10,55 +10,77 @@ import numpy as np
 
 from kiras_rl.envs.quadruped import QuadrupedEnv
 from kiras_rl.evaluation.flat import FLOOR
-from kiras_rl.evaluation.terrain import Obstacle
+from kiras_rl.evaluation.terrain import TIME_LIMIT, Obstacle
 from kiras_rl.tools.protocols import imitation
-from kiras_rl.tools.protocols.crossing import count, percent, pooled, share
+from kiras_rl.tools.protocols.crossing import KINDS, count, percent, pooled, share, shares
 from kiras_rl.tools.protocols.pooling import pool
 from kiras_rl.tools.protocols.rows import panels
 from kiras_rl.tools.protocols.subject import Subject
-from kiras_rl.tools.protocols.terrain import LEVELS, terrain_env
 from kiras_rl.tools.report.content import Column, Figure, Section, Table
 
 TITLE = "Heat map: steps and discrete footholds"
 TEXT = (
-    "As the protocol terrain, on steps (S) and discrete footholds (D), with many trials, and the "
-    "cosine to the keyframe on flat ground (C) beside them. Headline: steps of 6 cm, gaps of 8 cm "
-    "(times the scale of the robot's terrain). Kept: crossed in the skill's own keyframe, with "
+    "As the protocol terrain, on steps up and down (S) and discrete footholds (D) of given sizes, "
+    "with many trials, and the cosine to the keyframe on flat ground (C) beside them. Sizes are in "
+    "cm, times the scale of the robot's terrain. Kept: crossed in the skill's own keyframe, with "
     "mean errors of height and pitch over the ground it stands on of at most "
     f"{100 * FLOOR.height:.0f} cm and {math.degrees(FLOOR.pitch):.0f} degrees."
 )
 
-HEADLINE = {"S": Obstacle("stairs", 4), "D": Obstacle("footholds", 5)}
+SMALLEST, LARGEST = 2, 12  # cm: of a level each
+SIZES = {
+    "stairs_up": "riser",
+    "stairs_down": "riser",
+    "bars": "height",
+    "footholds": "gap",
+}
+"""What is measured of each type."""
+
+HEADLINE = {"S up": ("stairs_up", 6), "S down": ("stairs_down", 6), "D": ("footholds", 8)}
 OTHERS = (
-    *(Obstacle("stairs", level) for level in (2, 6, 8)),
-    *(Obstacle("footholds", level) for level in (2, 7, 10)),
+    *((name, size) for name in ("stairs_up", "stairs_down") for size in (4, 8, 10, 12)),
+    ("bars", 6),
+    *(("footholds", size) for size in (4, 6, 10)),
 )
+"""Type and size, cm."""
+
 HEADLINE_TRIALS, OTHER_TRIALS = 1000, 200  # of each skill [paper: 1,000]
 CHUNK = 200  # trials of a skill at a time: an interruption loses no more
 
 
 def measure(subject: Subject) -> dict:
     """Return the counts of each obstacle and skill, and the cosines."""
-    build, trials = cache(partial(terrain_env, subject)), subject.options.trials_or
+    build, trials = cache(partial(_build, subject)), subject.options.trials_or
     wanted = dict.fromkeys(HEADLINE.values(), trials(HEADLINE_TRIALS))
     wanted |= dict.fromkeys(OTHERS, trials(OTHER_TRIALS))
-    parts = {o: dict(_parts(subject, build, o, number)) for o, number in wanted.items()}
+    parts = {o: dict(_parts(subject, build, *o, number)) for o, number in wanted.items()}
     pieces = {key: run for runs in parts.values() for key, run in runs.items()}
     on_flat, run = imitation.piece(subject)
     results = subject.results(pieces | {on_flat: run})
     cells = {obstacle: pool([results[key] for key in keys]) for obstacle, keys in parts.items()}
     return {
-        "terrain": _lengths(subject),
+        "scale": subject.rough().env.terrain.scale,
         "headline": {name: cells[obstacle] for name, obstacle in HEADLINE.items()},
-        "others": [{"type": o.terrain, "level": o.level, "cells": cells[o]} for o in OTHERS],
+        "others": [{"type": o[0], "size": o[1], "cells": cells[o]} for o in OTHERS],
         "cosine": {name: values["cosine"] for name, values in results[on_flat]["skills"].items()},
     }
 
 
+def _build(subject: Subject, trials: int) -> QuadrupedEnv:
+    """Build the terrain of a policy with a level for each size, for `trials` of each skill."""
+    config = subject.rough()
+    ground = config.env.terrain
+    ground.levels = LARGEST - SMALLEST + 1
+    own, ends = ground.types, [SMALLEST / 100, LARGEST / 100]
+    ground.types = {name: own[name] | {key: ends} for name, key in SIZES.items()}
+    return subject.make_env(config, trials * len(subject.skills), TIME_LIMIT)
+
+
 def _parts(
-    subject: Subject, build: Callable[[int], QuadrupedEnv], obstacle: Obstacle, trials: int
+    subject: Subject, build: Callable[[int], QuadrupedEnv], terrain: str, size: int, trials: int
 ) -> Iterator[tuple[str, Callable[[], dict]]]:
     """Yield the key of each CHUNK of trials, and what measures it."""
+    obstacle = Obstacle(terrain, size - SMALLEST)
 
     def run(number: int, index: int) -> dict:
         return count(build(number), subject, [obstacle], number, index)[0]
@@ -67,8 +89,8 @@ def _parts(
         number = min(CHUNK, trials - done)
         key = subject.key(
             "heat_map",
-            type=obstacle.terrain,
-            level=obstacle.level,
+            type=terrain,
+            cm=size,
             part=index,
             trials=number,
             kept=f"{100 * FLOOR.height:g}cm,{math.degrees(FLOOR.pitch):g}deg",
@@ -76,39 +98,26 @@ def _parts(
         yield key, partial(run, number, index)
 
 
-def _lengths(subject: Subject) -> dict[str, list[float]]:
-    """Return the lowest and the top height of steps and width of moats, m."""
-    terrain = subject.rough().env.terrain
-    ranges = {
-        "stairs": terrain.types["stairs"]["riser"],
-        "footholds": terrain.types["footholds"]["gap"],
-    }
-    return {name: [terrain.scale * x for x in ends] for name, ends in ranges.items()}
-
-
 def section(results: dict[str, dict]) -> Section:
     """Return the heat maps, the shares with their intervals, and the other levels."""
     tables = [_headline(name, results) for name in HEADLINE]
     tables += [_others(label, values) for label, values in results.items()]
-    figures = [_figure(kind, results) for kind in ("success", "strict", "kept")]
+    figures = [_figure(kind, results) for kind in (*KINDS, "kept")]
     return Section("heat_map", TITLE, TEXT, tables, figures)
 
 
-def _size(values: dict, terrain: str, level: int) -> str:
-    low, high = values["terrain"][terrain]
-    word = {"stairs": "steps", "footholds": "gaps"}[terrain]
-    return f"{word} of {100 * (low + (high - low) * level / (LEVELS - 1)):.1f} cm"
+def _size(values: dict, terrain: str, size: int) -> str:
+    word = {"stairs_up": "steps up", "stairs_down": "steps down", "footholds": "gaps"}
+    return f"{word.get(terrain, terrain)} of {values['scale'] * size:g} cm"
 
 
 def _headline(name: str, results: dict[str, dict]) -> Table:
-    obstacle, first = HEADLINE[name], next(iter(results.values()))
+    first = next(iter(results.values()))
     rows = [
         (
             skill,
             label,
-            percent(counts, "success"),
-            percent(counts, "strict"),
-            percent(counts, "kept"),
+            *(percent(counts, kind) for kind in (*KINDS, "kept")),
             100 * share(counts, "fell"),
             counts["trials"],
         )
@@ -119,12 +128,13 @@ def _headline(name: str, results: dict[str, dict]) -> Table:
         Column("skill"),
         Column("policy"),
         Column("success", "%"),
+        Column("feet only", "%"),
         Column("strict", "%"),
         Column("kept", "%"),
         Column("falls", "%", "{:.0f}"),
         Column("trials", form="{}"),
     )
-    title = f"{name}: {_size(first, obstacle.terrain, obstacle.level)}"
+    title = f"{name}: {_size(first, *HEADLINE[name])}"
     return Table(title, columns, rows, "In brackets Wilson's 95 % intervals.")
 
 
@@ -133,21 +143,22 @@ def _with_all(cells: dict[str, dict]) -> dict[str, dict]:
 
 
 def _others(label: str, values: dict) -> Table:
-    rows, skills = [], list(values["headline"]["S"])
+    rows, skills = [], list(next(iter(values["headline"].values())))
     for cell in values["others"]:
-        shares = [
-            " / ".join(f"{100 * share(c, kind):.0f}" for kind in ("success", "strict", "kept"))
-            for c in _with_all(cell["cells"]).values()
+        texts = [
+            f"{shares(c)} / {100 * share(c, 'kept'):.0f}" for c in _with_all(cell["cells"]).values()
         ]
-        rows.append((_size(values, cell["type"], cell["level"]), *shares))
+        rows.append((_size(values, cell["type"], cell["size"]), *texts))
     columns = (Column("obstacle"), *map(Column, skills), Column("all"))
-    return Table(f"Other sizes: {label}", columns, rows, "Success / strict / kept in %.")
+    return Table(
+        f"Other sizes: {label}", columns, rows, "Success / on feet only / strict / kept, in %."
+    )
 
 
 def _figure(kind: str, results: dict[str, dict]) -> Figure:
-    drawing, axes = panels(3, width=1.2 + 0.9 * len(results), height=3.0)
+    drawing, axes = panels(1 + len(HEADLINE), width=1.2 + 0.9 * len(results), height=3.0)
     skills = list(next(iter(results.values()))["cosine"])
-    for axis, name in zip(axes, ("C", "S", "D"), strict=True):
+    for axis, name in zip(axes, ("C", *HEADLINE), strict=True):
         cells = np.array(
             [
                 [

@@ -6,7 +6,7 @@ from functools import cache, partial
 
 from kiras_rl.envs.quadruped import QuadrupedEnv
 from kiras_rl.evaluation.terrain import TIME_LIMIT, Obstacle
-from kiras_rl.tools.protocols.crossing import count, share
+from kiras_rl.tools.protocols.crossing import KINDS_NOTE, count, share, shares
 from kiras_rl.tools.protocols.rows import colours, panels
 from kiras_rl.tools.protocols.subject import Subject
 from kiras_rl.tools.report.content import Column, Figure, Section, Table
@@ -20,12 +20,12 @@ TEXT = (
 TRIALS = 200  # of a cell
 STEPS = (5, 8, 10, 15)  # cm
 ANGLES = (15, 25, 35, 45)  # degrees
-UP, DOWN = 0, 1  # variants: every second one leads the other way
+UP = 0  # variant: every second slope leads down
 
 COURSES = {
     "slope up": [(angle, Obstacle("slopes", (angle - 5) // 10 - 1, UP)) for angle in ANGLES],
-    "stairs up": [(step, Obstacle("stairs", step - 5, UP)) for step in STEPS],
-    "stairs down": [(step, Obstacle("stairs", step - 5, DOWN)) for step in STEPS],
+    "stairs up": [(step, Obstacle("stairs_up", step - 5)) for step in STEPS],
+    "stairs down": [(step, Obstacle("stairs_down", step - 5)) for step in STEPS],
 }
 """Course -> sizes and tiles. The terrain has levels of a centimetre, and of 10 degrees."""
 
@@ -74,7 +74,7 @@ def _build(subject: Subject, terrain: str, trials: int) -> QuadrupedEnv:
     else:
         ground.levels = STEPS[-1] - STEPS[0] + 1
         risers = [STEPS[0] / 100, STEPS[-1] / 100]
-        ground.types = {"stairs": {"proportion": 1.0, "riser": risers, "tread": 0.3}}
+        ground.types = {terrain: {"proportion": 1.0, "riser": risers, "tread": 0.3}}
     worlds = trials * len(subject.skills)
     return subject.make_env(config, worlds, TIME_LIMIT)
 
@@ -91,13 +91,10 @@ def _table(course: str, results: dict[str, dict]) -> Table:
     for label, values in results.items():
         for size, cells in values["courses"][course].items():
             skills = list(cells)
-            texts = (
-                f"{100 * share(c, 'success'):.0f} ({100 * share(c, 'strict'):.0f})"
-                for c in cells.values()
-            )
+            texts = map(shares, cells.values())
             rows.append((_size(course, size, values["scale"]), label, *texts))
     columns = (Column("size"), Column("policy"), *map(Column, skills))
-    return Table(course.capitalize(), columns, rows, "Success in %, in brackets strict success.")
+    return Table(course.capitalize(), columns, rows, KINDS_NOTE)
 
 
 def _size(course: str, size: str, scale: float) -> str:
@@ -124,11 +121,11 @@ def _figure(label: str, values: dict) -> Figure:
         scale = 1.0 if unit == "deg" else values["scale"]
         for skill, colour in zip(skills, colours(), strict=False):
             points = [scale * int(size) for size in sizes]
-            for kind, style in (("success", "--"), ("strict", "-")):
-                shares = [100 * share(cells[skill], kind) for cells in sizes.values()]
-                name = skill if kind == "strict" else None
-                axis.plot(points, shares, style, color=colour, label=name, marker="o", ms=3)
+            for kind, style in (("success", "--"), ("feet_only", "-")):
+                percents = [100 * share(cells[skill], kind) for cells in sizes.values()]
+                name = skill if kind == "feet_only" else None
+                axis.plot(points, percents, style, color=colour, label=name, marker="o", ms=3)
         axis.set(title=course, xlabel=f"[{unit}]", ylim=(-3, 103))
     axes[0].set_ylabel("success [%]")
     axes[-1].legend(fontsize=7)
-    return Figure(f"Slopes and stairs: {label}", drawing, "Dashed: success; solid: strict success.")
+    return Figure(f"Slopes and stairs: {label}", drawing, "Dashed: success; solid: on feet only.")

@@ -262,7 +262,7 @@ def test_on_another_ground_it_stands_in_the_chosen_skill(cockpit):
     cockpit.choose_skill("stilt")
     cockpit.set_target(FORWARD, 0.3)
     run(cockpit, 0.5)
-    cockpit.choose_tile(kind="stairs", level=4)
+    cockpit.choose_tile(kind="stairs_up", level=4)
     assert cockpit.skill == 2
     assert not cockpit.target.any()
     height = cockpit.driver.metadata.keyframes["stilt"].base_height
@@ -280,11 +280,11 @@ def test_at_the_end_of_a_tile_it_goes_on_in_the_middle(cockpit):
 
 
 def test_another_policy_takes_over_on_the_same_ground(cockpit, exported):
-    cockpit.choose_tile(kind="stairs", level=4, variant=1)
+    cockpit.choose_tile(kind="stairs_up", level=4, variant=1)
     run(cockpit, 0.2)
     qpos = cockpit.driver.data.qpos.copy()
     cockpit.load(OnboardPolicy(exported[2]), "another")
-    assert cockpit.tile == Tile("stairs", 4, 1)
+    assert cockpit.tile == Tile("stairs_up", 4, 1)
     np.testing.assert_array_equal(cockpit.driver.data.qpos, qpos)
 
 
@@ -294,7 +294,7 @@ def test_a_policy_of_another_terrain_stands_on_its_own(
     config = load_config("base", ["finetuning.env.terrain.levels=3"])
     metadata = make_metadata(provenance={"config": config_to_dict(config)})
     export_policy(make_policy(metadata, gain=0.0), metadata, tmp_path / "a.onnx")
-    cockpit.choose_tile(kind="stairs", level=4)
+    cockpit.choose_tile(kind="stairs_up", level=4)
     cockpit.load(OnboardPolicy(tmp_path / "a.onnx"), "three levels")
-    assert cockpit.tile == Tile("stairs", 2, 0)
+    assert cockpit.tile == Tile("stairs_up", 2, 0)
     assert cockpit.advance().base_height == pytest.approx(0.2, abs=0.05)

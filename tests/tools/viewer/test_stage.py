@@ -74,7 +74,7 @@ def test_a_new_policy_for_the_same_robot_keeps_the_scene(still_file):
 def test_the_ghost_stands_on_the_ground_under_it(still_file, smooth_terrain):
     """From 1.5 to 1.8 m from the middle is the fourth step up, four risers of 12 cm high."""
     driver = Driver(OnboardPolicy(still_file), smooth_terrain)
-    driver.show("stairs", level=9)
+    driver.show("stairs_up", level=9)
     stage = Stage(driver)
     driver.data.qpos[:3] = (1.65, 0.0, 3.0)
     stage.pose()
@@ -84,7 +84,7 @@ def test_the_ghost_stands_on_the_ground_under_it(still_file, smooth_terrain):
 def test_another_ground_is_another_scene_with_the_terrain_in_it(still_file):
     driver = Driver(OnboardPolicy(still_file))
     flat = Stage(driver)
-    driver.show("stairs", level=4)
+    driver.show("stairs_up", level=4)
     stage = flat.move_to(driver)
     assert stage is not flat
     assert stage.model.ngeom > flat.model.ngeom

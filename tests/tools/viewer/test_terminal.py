@@ -84,7 +84,7 @@ def test_a_speed_that_cannot_be_changed_is_not_shown(still_file):
 
 
 def test_the_screen_names_the_ground_and_counts_tiles(still_file):
-    cockpit = Cockpit(OnboardPolicy(still_file), tile=Tile("stairs", 4, 1))
+    cockpit = Cockpit(OnboardPolicy(still_file), tile=Tile("stairs_up", 4, 1))
     text = "\n".join(lines(cockpit, View()))
-    for part in ("terrain stairs:4:1", "crossed 0", "F next terrain"):
+    for part in ("terrain stairs_up:4:1", "crossed 0", "F next terrain"):
         assert part in text
