@@ -22,6 +22,7 @@ def make_env(
     device: torch.device | str = "cpu",
     num_envs: int | None = None,
     robot: Robot | None = None,
+    progress: float = 1.0,
 ) -> QuadrupedEnv:
     """Build the environment of a configuration.
 
@@ -30,6 +31,7 @@ def make_env(
         device: Where the tensors live; `auto` takes the native backend on a CPU, else warp.
         num_envs: Worlds, if not the configuration's.
         robot: The robot, if not the configuration's: one with other keyframes, say.
+        progress: How much of a phase is done; what changes over it has the value of then.
 
     Raises:
         ConfigError: Unknown backend, or the native backend on a GPU.
@@ -49,6 +51,7 @@ def make_env(
         resolve_backend(config.sim.backend, device),
         device,
         config.seed,
+        progress,
     )
 
 

@@ -28,6 +28,7 @@ class Observer:
         clean: Proprio part of the last observation without errors of sensors, (N, P).
         features: Phi of the last observation, (N, D).
         observation: The last observation.
+        noise: Share of the noise that observations have, ().
     """
 
     def __init__(self, config: ObservationConfig, view: View) -> None:
@@ -37,6 +38,7 @@ class Observer:
         self.critic = ObservationGroup("critic", config.critic, view)
         self.imitation = ObservationGroup("imitation", config.imitation, view)
         self.clean, self.features = self.proprio(view), self.imitation(view)
+        self.noise = torch.ones((), device=self.clean.device)
         self._frame = self.clean
         self._history = self._frame[:, None].repeat(1, config.history_length, 1)  # (N, H, P)
         self.observation = TensorDict()
@@ -108,7 +110,7 @@ class Observer:
     def _with_noise(self, read: torch.Tensor, random: UniformBuffer) -> torch.Tensor:
         if not self._config.noise:
             return read
-        return read + self.proprio.noise * scale_to(random[NOISE], -1.0, 1.0)
+        return read + self.noise * self.proprio.noise * scale_to(random[NOISE], -1.0, 1.0)
 
     def state_dict(self) -> dict:
         """Return all that the next observation depends on."""

@@ -35,6 +35,7 @@ from kiras_rl.interfaces import Measurements, SkillEnv
 from kiras_rl.recorded import Recorded, copied
 from kiras_rl.robots.identity import change, identity
 from kiras_rl.robots.robot import Robot
+from kiras_rl.schedules import piecewise_linear
 from kiras_rl.schema import EnvConfig, SimConfig
 
 GRAVITY = 9.81  # m/s^2
@@ -54,8 +55,12 @@ class QuadrupedEnv(SkillEnv):
         backend: str,
         device: torch.device,
         seed: int,
+        progress: float = 1.0,
     ) -> None:
-        """Build the scene, the worlds and the terms, and reset every world."""
+        """Build the scene, the worlds and the terms, and reset every world.
+
+        `progress` is how much of a phase is done; see `set_progress`.
+        """
         self.cfg, self.robot_cfg = cfg, robot
         self.num_envs, self.num_actions = num_envs, len(robot.joint_names)
         self.device = device
@@ -87,6 +92,7 @@ class QuadrupedEnv(SkillEnv):
             self.terrains, self.terrain_levels = self._library.types, self._library.levels
         self._allocate(robot)
         self._build_terms(seed)
+        self.set_progress(progress)
         self._begin()
 
     # --- construction -------------------------------------------------------------------------
@@ -294,7 +300,7 @@ class QuadrupedEnv(SkillEnv):
     def _reset_worlds(self, mask: torch.Tensor, start: torch.Tensor) -> None:
         """Put the masked worlds into the keyframes `start`, (N,), with new physics and ground."""
         self._randomizer.reset(mask)
-        self._sensors.reset(mask)
+        self._sensors.reset(mask, self._randomizer.randomized)
         if self._curriculum:
             self._curriculum.begin(mask, self.task.skill)
             self._write_terrain(
@@ -405,6 +411,9 @@ class QuadrupedEnv(SkillEnv):
     def set_progress(self, progress: float) -> None:
         """Set what changes over a phase to its value at this share of it, in [0, 1]."""
         self._rewards.set_progress(progress)
+        share = piecewise_linear(self.cfg.randomized_share, progress)
+        for tensor in (self._randomizer.share, self._observer.noise):
+            tensor.fill_(share)  # in place: a graph reads it
 
     def measure(self) -> Measurements:
         """Return the measurements of the last step, before its resets."""

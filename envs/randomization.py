@@ -1,4 +1,7 @@
-"""Domain randomization: the paper's table, drawn anew in every world at every reset."""
+"""Domain randomization, drawn anew in every world at every reset.
+
+A share of the episodes is randomized, which may grow over a phase; the others are nominal.
+"""
 
 from __future__ import annotations
 
@@ -23,6 +26,7 @@ KP, KD = 4, 6  # columns of a DC motor's gainprm that hold the gains of its cont
 def columns(num_joints: int) -> dict[str, int]:
     """Return the random numbers that this module takes each step."""
     return {
+        "randomized": 1,
         "friction": 1,
         "body": 1,
         "kp_factor": 1,
@@ -38,12 +42,17 @@ def columns(num_joints: int) -> dict[str, int]:
 
 
 class Randomizer:
-    """Writes model fields of the worlds that reset, and pushes bases now and then."""
+    """Writes model fields of the worlds that reset, and pushes bases now and then.
+
+    Attributes:
+        share: Of the episodes that are randomized, ().
+    """
 
     def __init__(
         self, config: RandomizationConfig, scene: Scene, sim: Simulation, random: UniformBuffer
     ) -> None:
         """Remember the nominal values."""
+        self.share = torch.ones((), device=sim.device)
         self._config, self._scene, self._sim, self._random = config, scene, sim, random
         model = scene.model
 
@@ -58,19 +67,28 @@ class Randomizer:
         self._bodies = None
         if config.payload or config.com_shift or config.leg_mass_factor:
             fields = draw_bodies(scene, config.payload, config.com_shift, config.leg_mass_factor)
-            self._bodies = {name: values.to(sim.device) for name, values in fields.items()}
+            self._bodies = {  # and as the last row the nominal one
+                name: torch.cat([values.to(sim.device), nominal(name)[:1]])
+                for name, values in fields.items()
+            }
         self._gain = nominal("actuator_gainprm")
         self._delay = nominal("actuator_delay")
         self._limits = nominal("actuator_forcerange")
         self._joints = {name: nominal(name) for name in ("dof_frictionloss", "dof_damping")}
 
+    @property
+    def randomized(self) -> torch.Tensor:
+        """Worlds that would be randomized if they began now, (N, 1) bool."""
+        return self._random["randomized"] < self.share
+
     def reset(self, mask: torch.Tensor) -> None:
         """Draw the physics of the masked worlds, (N,) bool."""
         config = self._config
         if config.friction:
-            self._write_friction(mask, self._draw("friction"))
+            self._write_friction(mask)
         if self._bodies:
-            number = scale_to(self._random["body"][:, 0], 0.0, BODIES).long()
+            number = scale_to(self._random["body"], 0.0, BODIES).long()
+            number = torch.where(self.randomized, number, BODIES).squeeze(1)
             for name, values in self._bodies.items():
                 self._sim.write_field(name, mask, values[number])
         if config.kp_factor or config.kd_factor or config.motor_factor:
@@ -78,7 +96,7 @@ class Randomizer:
         self._write_joints(mask, "dof_frictionloss", "joint_friction_factor")
         self._write_joints(mask, "dof_damping", "joint_damping_factor")
         if config.torque_factor:
-            factor = self._draw("torque_factor")
+            factor = self._factor("torque_factor")
             self._sim.write_field("actuator_forcerange", mask, self._limits * factor[:, None])
         if config.action_delay:
             self._write_delay(mask, config.action_delay)
@@ -90,24 +108,27 @@ class Randomizer:
         mask = self._random["push_chance"][:, 0] < rate
         return mask, scale_to(self._random["push"], *limits)
 
-    def _draw(self, name: str) -> torch.Tensor:
-        """Draw values of one of the configured ranges, (N, 1) or (N, J)."""
-        return scale_to(self._random[name], *getattr(self._config, name))
+    def _factor(self, name: str) -> torch.Tensor:
+        """Draw factors of one of the configured ranges, 1 in nominal worlds, (N, 1) or (N, J)."""
+        drawn = scale_to(self._random[name], *getattr(self._config, name))
+        return torch.where(self.randomized, drawn, 1.0)
 
-    def _write_friction(self, mask: torch.Tensor, friction: torch.Tensor) -> None:
+    def _write_friction(self, mask: torch.Tensor) -> None:
+        friction = scale_to(self._random["friction"], *self._config.friction)
         # (N, 1) on every geom of the robot; by a mask: a list of them would be copied to the GPU
-        values = torch.where(self._slides, friction[..., None], self._friction)
+        slides = self._slides & self.randomized[..., None]
+        values = torch.where(slides, friction[..., None], self._friction)
         self._sim.write_field("geom_friction", mask, values)
 
     def _write_gains(self, mask: torch.Tensor) -> None:
         """Scale the gains: of all joints alike, and of each by the strength of its motor."""
         gain, config = self._gain.clone(), self._config
         if config.kp_factor:
-            gain[..., KP].mul_(self._draw("kp_factor"))
+            gain[..., KP].mul_(self._factor("kp_factor"))
         if config.kd_factor:
-            gain[..., KD].mul_(self._draw("kd_factor"))
+            gain[..., KD].mul_(self._factor("kd_factor"))
         if config.motor_factor:
-            strength = self._draw("motor_factor")
+            strength = self._factor("motor_factor")
             gain[..., KP].mul_(strength)
             gain[..., KD].mul_(strength)
         self._sim.write_field("actuator_gainprm", mask, gain)
@@ -116,7 +137,7 @@ class Randomizer:
         """Scale friction or damping, a factor of its own for each joint."""
         if getattr(self._config, name):
             values = self._joints[field].clone()
-            values[:, BASE_DOFS:].mul_(self._draw(name))
+            values[:, BASE_DOFS:].mul_(self._factor(name))
             self._sim.write_field(field, mask, values)
 
     def _write_delay(self, mask: torch.Tensor, limits: tuple[int, int]) -> None:
@@ -124,6 +145,7 @@ class Randomizer:
         steps = scale_to(self._random["action_delay"], limits[0], limits[1] + 1).floor()
         # Half a step less than k steps still reads the target of k steps ago, and stays right when
         # float32 time has lost its last digits after 16 s.
+        steps = torch.where(self.randomized, steps, 0.0)
         seconds = (steps - 0.5).clamp(min=0.0) * self._scene.model.opt.timestep
         self._sim.write_field("actuator_delay", mask, seconds.expand_as(self._delay))
 

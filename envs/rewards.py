@@ -263,14 +263,17 @@ class RewardSum:
         self._terms = [_bind(name, values) for name, values in terms.items()]
         self.functions = [term.func for term in self._terms]
         self._scale = step_dt if config.scale_by_dt else 1.0
+        self._penalty_scale = config.penalty_scale
         self._schedules = [_schedule(values["weight"]) for values in terms.values()]
         self._weights = torch.empty(len(terms), device=device)
-        self.set_progress(0.0)
+        self.set_progress(1.0)
 
     def set_progress(self, progress: float) -> None:
         """Set the weights to those of this share of the phase, in [0, 1]."""
-        weights = [piecewise_linear(points, progress) for points in self._schedules]
-        self._weights.copy_(self._scale * torch.tensor(weights))  # in place: a graph reads it
+        weights = torch.tensor([piecewise_linear(p, progress) for p in self._schedules])
+        penalty = piecewise_linear(self._penalty_scale, progress)
+        weights = torch.where(weights < 0.0, penalty * weights, weights)
+        self._weights.copy_(self._scale * weights)  # in place: a graph reads it
 
     def __call__(self, step: Step) -> torch.Tensor:
         """Return the weighted terms, (N, number of terms).

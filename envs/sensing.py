@@ -90,10 +90,10 @@ class Sensors:
         """What encoders read at angle 0, (N, J), rad."""
         return self.errors[:, :-7]
 
-    def reset(self, worlds: torch.Tensor) -> None:
-        """Draw the errors of some worlds, (N,) bool."""
+    def reset(self, worlds: torch.Tensor, randomized: torch.Tensor) -> None:
+        """Draw the errors of some worlds, (N,) bool; none where not `randomized`, (N, 1) bool."""
         if not self.are_exact:
-            drawn = self._low + self._span * self._random["sensors"]
+            drawn = (self._low + self._span * self._random["sensors"]) * randomized
             self.errors = torch.where(worlds[:, None], drawn, self.errors)
 
     def read(self, robot: RobotState, begun: torch.Tensor) -> Sensed:

@@ -67,6 +67,7 @@ LIMITS = {
     "sim.max_ccd": Limits(0, 100_000),
     "env.action_clip": Limits(0, 1000, above=True),
     "env.observations.history_length": Limits(0, 1000, above=True),
+    "env.rewards.penalty_scale": _NOT_NEGATIVE,
     "env.commands.lin_vel_x": Limits(-20, 20),
     "env.commands.lin_vel_y": Limits(-20, 20),
     "env.commands.ang_vel_z": Limits(-20, 20),
@@ -80,6 +81,7 @@ LIMITS = {
     "env.terminations.episode_length": _POSITIVE,
     "env.terminations.base_contact_force": _NOT_NEGATIVE,
     "env.terminations.max_tilt": Limits(0, 180, above=True),
+    "env.randomized_share": _SHARE,
     "env.randomization.friction": _FACTOR,
     "env.randomization.payload": Limits(-1000, 1000),
     "env.randomization.com_shift": Limits(-10, 10),
@@ -186,8 +188,11 @@ PARAMETERS = {
 _ANY = Limits(-LARGEST, LARGEST)
 
 SCHEDULES = (
+    "env.rewards.penalty_scale",
+    "env.randomized_share",
     "learner.ppo.action_std",
     "learner.ppo.desired_kl",
+    "learner.imitation.whole_from",
     "learner.imitation.discriminator.noise",
 )
 """Lists of [fraction of T1, value]."""

@@ -40,6 +40,7 @@ class RewardConfig:
     """Task reward: term name -> {weight, parameters of the term}; null removes a term."""
 
     scale_by_dt: bool
+    penalty_scale: list[list[float]]
     terms: dict[str, Any]
 
 
@@ -137,6 +138,7 @@ class EnvConfig:
     commands: CommandConfig
     skills: SkillConfig
     terminations: TerminationConfig
+    randomized_share: list[list[float]]
     randomization: RandomizationConfig
     terrain: TerrainConfig | None
 
@@ -174,7 +176,7 @@ class ImitationConfig:
     """Self-imitation learning."""
 
     reward_weight: float
-    whole_from: float
+    whole_from: list[list[float]]
     discriminator: DiscriminatorConfig
     premium: PremiumConfig
 

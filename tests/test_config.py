@@ -350,7 +350,14 @@ def test_the_changes_of_finetuning_are_looked_at_with_what_they_change(override,
     + [(SCHEDULES[0], points) for points in ("[]", "[[0.5]]", "[[0,1,2]]")],
 )
 def test_a_schedule_is_a_list_of_points_in_order(key, points):
-    assert "give [fraction of T1, value] points" in refusal("solo8", [f"{key}={points}"])
+    assert "give [share of the phase, value] points" in refusal("solo8", [f"{key}={points}"])
+
+
+@pytest.mark.parametrize("points", ["[]", "[[0.5,1],[0,1]]", "[[0,a]]", "[1,2]"])
+def test_a_weight_is_a_number_or_a_schedule(points):
+    key = "env.rewards.terms.torques.weight"
+    message = refusal("solo8", [f"{key}={points}"])
+    assert message.startswith(f"{key}=") and "give a number or [share of the phase" in message
 
 
 @pytest.mark.parametrize("last", [0, -0.1])

@@ -191,7 +191,7 @@ def build(
     alone = phase_config(config, phase)
     alone.seed += distributed.rank()  # every rank has worlds of its own, and its share of the cores
     alone.sim.threads = alone.sim.threads or distributed.core_share()
-    env = make_env(alone, device, num_envs)
+    env = make_env(alone, device, num_envs, progress=0.0)
     evaluators = make_evaluators(config, phase, device)
     runner = KirasRunner(env, config, run_dir, device, evaluators, source_commit(), phase)
     # What could not be exported is refused now, not after hours of training.

@@ -169,7 +169,7 @@ class KirasPPO(PPO):
                 self.storage, self.num_mini_batches, self.learning_rate
             )
         if self.imitation:
-            scalars |= self.imitation.update(self.storage, self.iteration, self.progress)
+            scalars |= self.imitation.update(self.storage, self.iteration)
         self.storage.clear()
         self.iteration += 1
         self._apply_schedules()
@@ -260,11 +260,13 @@ class KirasPPO(PPO):
         return kl
 
     def _apply_schedules(self) -> None:
-        """Set the action noise and the KL divergence of the next iteration."""
+        """Set the action noise, the KL divergence and the imitation of the next iteration."""
         self.actor.distribution.std_param.fill_(
             piecewise_linear(self.config.ppo.action_std, self.progress)
         )
         self.desired_kl.fill_(piecewise_linear(self.config.ppo.desired_kl, self.progress))
+        if self.imitation:
+            self.imitation.set_progress(self.progress)
 
     # --- skills ---------------------------------------------------------------------------------
 

@@ -59,6 +59,7 @@ class SelfImitation:
         self._noise = feature_noise.repeat(2)
         self._smooth = ~skill_code.repeat(2)
         self._noise_factor = torch.ones((), device=device)
+        self._whole_from = torch.zeros((), device=device)
         dims = config.discriminator.hidden_dims
         self.discriminator = Discriminator(features, dims, bfloat16).to(device)
         rate = config.discriminator.learning_rate
@@ -147,10 +148,15 @@ class SelfImitation:
             speed: Commanded, (N,), m/s.
             progress: Velocity along the command, (N,), m/s.
         """
-        whole = self.config.whole_from * speed
+        whole = self._whole_from * speed
         share = (progress / whole.clamp(min=1e-6)).clamp(0.0, 1.0)
         moves = (speed >= self.config.premium.min_command) & (whole > 0.0)
         return torch.where(moves, share, 1.0)
+
+    def set_progress(self, progress: float) -> None:
+        """Set what changes over the phase to its value at this share of it."""
+        self._whole_from.fill_(piecewise_linear(self.config.whole_from, progress))
+        self._noise_factor.fill_(piecewise_linear(self.config.discriminator.noise, progress))
 
     @torch.no_grad()
     def rewards(self) -> torch.Tensor:
@@ -161,15 +167,12 @@ class SelfImitation:
         self._rewards = self.config.reward_weight * imitation_reward(score) * earned
         return self._rewards
 
-    def update(
-        self, storage: GroupRolloutStorage, iteration: int, progress: float
-    ) -> dict[str, float]:
+    def update(self, storage: GroupRolloutStorage, iteration: int) -> dict[str, float]:
         """Renew the premium buffer, train the discriminator; return scalars for the log."""
         one_hot = storage.observations[names.SKILL]
         scalars = self._describe(one_hot)
         self.selector.select(iteration)
         self._skill = one_hot.flatten(0, 1).argmax(dim=-1)
-        self._noise_factor.fill_(piecewise_linear(self.config.discriminator.noise, progress))
         for _ in range(self.config.discriminator.updates):
             numbers = self._train()
         loss, expert, policy = numbers.tolist()

@@ -127,6 +127,25 @@ def test_without_randomization_physics_is_nominal(build):
         assert torch.equal(field(env, name), nominal.expand(8, *nominal.shape)), name
 
 
+def test_a_share_of_the_episodes_is_randomized(build_env):
+    env = build_env("env.randomized_share=[[0,0],[1,0.5]]", num_envs=200)  # at the end of a phase
+    friction = field(env, "geom_friction")[:, env.sim.model.geom("FL_foot").id, 0]
+    delay, gain = field(env, "actuator_delay")[:, 0], field(env, "actuator_gainprm")[:, 0, KP]
+    mass = field(env, "body_mass")[:, env.sim.model.body("base").id]
+    model = env.sim.model
+    nominal = (friction == model.geom_friction[model.geom("FL_foot").id, 0]) & (delay == 0)
+    nominal &= (gain == 5.0) & (mass == torch.tensor(model.body("base").mass).float())
+    assert nominal.float().mean().item() == pytest.approx(0.5, abs=0.11)
+    exact = (env._sensors.errors == 0).all(dim=1)
+    assert torch.equal(exact, nominal)
+    env.set_progress(0.0)
+    env.reset()
+    assert torch.equal(field(env, "actuator_gainprm")[:, 0, KP], torch.full((200,), 5.0))
+    assert (env._sensors.errors == 0).all()
+    proprio = env.get_observations()
+    assert torch.equal(proprio["proprio"], env._observer.clean)  # without noise
+
+
 # --- the motion ----------------------------------------------------------------------------------
 
 

@@ -15,6 +15,7 @@ from kiras_rl.envs.state import Keyframes, Limits, RobotState, Step, Task
 from kiras_rl.schema import RewardConfig
 
 WALK, CRAWL = 0, 1
+CONSTANT = [[0.0, 1.0]]  # factor of penalties
 KEYFRAMES = Keyframes(
     height=torch.tensor([0.2, 0.1]),
     clearance=torch.tensor([0.06, 0.04]),
@@ -67,13 +68,14 @@ def crafted(command=(0.5, 0.0, 0.2), fresh=False, fallen=False):
         memory={air_time: row(0.12, 0.5), stance_time: row(0.0, 0.1), swing_peak: row(0.03, 0.02)},
         fresh=torch.tensor([fresh]),
         fallen=torch.tensor([fallen]),
+        weight=20.0,
         dt=0.02,
     )
 
 
 def value(name, step, **parameters):
     """Return a term's value with weight 1."""
-    config = RewardConfig(scale_by_dt=False, terms={name: {"weight": 1.0} | parameters})
+    config = RewardConfig(False, CONSTANT, terms={name: {"weight": 1.0} | parameters})
     return RewardSum(config, step.dt, torch.device("cpu"))(step).item()
 
 
@@ -102,6 +104,7 @@ EXPECTED = {
     "feet_drag": ({}, -(0.3 + 0.4)),
     "foot_clearance": ({"height": 0.05}, 0.04 * 0.5),  # the other foot is high enough
     "feet_contact_forces": ({"threshold": 10.0, "largest": 20.0}, 20.0 + 2.0),
+    "limb_load": ({}, (0.05 + 3.0) / 20.0),
     "collision": ({"threshold": 0.1}, 1.0),
     "stand_still": ({}, 0.0),
     "stand_still_pose": ({}, 0.0),
@@ -178,10 +181,34 @@ def test_a_fall_is_told():
 @pytest.mark.parametrize(("scale_by_dt", "factor"), [(False, 1.0), (True, 0.02)])
 def test_terms_are_weighed_and_scaled(scale_by_dt, factor):
     terms = {"torques": {"weight": -0.1}, "action_rate": None, "lin_vel_y_abs": {"weight": 3.0}}
-    total = RewardSum(RewardConfig(scale_by_dt, terms), 0.02, torch.device("cpu"))
+    total = RewardSum(RewardConfig(scale_by_dt, CONSTANT, terms), 0.02, torch.device("cpu"))
     assert total.names == ["torques", "lin_vel_y_abs"]
     expected = torch.tensor([[-0.5, 0.3]]) * factor
     torch.testing.assert_close(total(crafted()), expected)
+
+
+def test_a_limb_that_bears_more_than_the_weight_counts_once():
+    step = crafted()
+    step.robot.limb_force = row(50.0, 10.0)
+    assert value("limb_load", step) == pytest.approx(1.0 + 0.5)
+
+
+def test_errors_of_posture_within_the_slack_cost_nothing():
+    step = crafted()  # 5 cm above crawl
+    assert value("skill_height", step, sigma=0.05, slack=0.05) == pytest.approx(1.0)
+    assert value("skill_height", step, sigma=0.05, slack=0.02) == pytest.approx(math.exp(-(0.6**2)))
+    error = math.hypot(0.6, 0.2)
+    expected = math.exp(-(((error - 0.1) / 0.4) ** 2))
+    assert value("skill_orientation", step, sigma=0.4, slack=0.1) == pytest.approx(expected)
+
+
+def test_weights_and_penalties_follow_their_schedules():
+    terms = {"torques": {"weight": [[0.0, -0.1], [0.5, -0.3]]}, "lin_vel_y_abs": {"weight": 3.0}}
+    config = RewardConfig(False, [[0.0, 0.5], [1.0, 1.0]], terms)
+    total = RewardSum(config, 0.02, torch.device("cpu"))
+    for progress, weight in ((0.0, -0.1 * 0.5), (0.25, -0.2 * 0.625), (1.0, -0.3)):
+        total.set_progress(progress)
+        torch.testing.assert_close(total(crafted()), torch.tensor([[5.0 * weight, 0.3]]))
 
 
 @pytest.mark.parametrize(
@@ -196,5 +223,5 @@ def test_terms_are_weighed_and_scaled(scale_by_dt, factor):
 )
 def test_a_term_that_cannot_be_is_refused(terms, message):
     with pytest.raises(ConfigError) as caught:
-        RewardSum(RewardConfig(scale_by_dt=False, terms=terms), 0.02, torch.device("cpu"))
+        RewardSum(RewardConfig(False, CONSTANT, terms), 0.02, torch.device("cpu"))
     assert message in str(caught.value)

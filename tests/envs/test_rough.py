@@ -81,6 +81,19 @@ def test_robots_stand_on_their_platform_in_their_keyframe(env, name):
     assert env.robot.foot_height.abs().max() < 0.003
 
 
+def test_rough_ground_has_tasks_of_its_own(build):
+    env = build("num_envs=600")
+    flat = env._curriculum.is_flat
+    env.reset()
+    command, heading = env.task.command, env.task.heading
+    moving = command[:, 0] != 0
+    ahead = command[~flat & moving, 0]
+    assert ahead.min() >= 0.25 and ahead.max() <= 0.6
+    assert not heading[~flat & moving].isnan().any()
+    assert command[flat, 0].min() < -0.2 and heading[flat].isnan().all()
+    assert (~moving[~flat]).float().mean().item() == pytest.approx(0.03, abs=0.03)
+
+
 def test_headings_are_drawn_all_round(build):
     env = build("num_envs=64")
     place(env, "flat")

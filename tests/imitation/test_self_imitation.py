@@ -77,7 +77,7 @@ def test_it_tells_a_shifted_motion_from_the_keyframes(make_imitation, bfloat16):
     imitation = make_imitation(bfloat16=bfloat16)
     for iteration in range(60):
         first, storage = rollout(imitation, [0.0, 0.5])
-        scalars = imitation.update(storage, iteration, progress=0.0)
+        scalars = imitation.update(storage, iteration)
     assert scalars["Discriminator/expert"] > 0.8
     assert scalars["Discriminator/policy"] < -0.8
     assert first.max() < 0.3  # what the policy does earns little,
@@ -98,7 +98,7 @@ def test_the_gradient_penalty_keeps_the_slope_low(make_imitation):
     imitation = make_imitation("learner.imitation.discriminator.gradient_penalty=1")
     for iteration in range(40):
         _, storage = rollout(imitation, [0.0, 0.5])
-        scalars = imitation.update(storage, iteration, progress=1.0)
+        scalars = imitation.update(storage, iteration)
     # A line of slope s in both frames scores +-s/2 half a unit apart, and its squared gradient is
     # 2 s^2: 2 (1 - s/2)^2 + 2 s^2 is least at s = 2/5.
     assert scalars["Discriminator/expert"] == pytest.approx(0.2, abs=0.02)
@@ -109,14 +109,29 @@ def test_the_gradient_penalty_keeps_the_slope_low(make_imitation):
 def test_premium_motions_go_where_they_are_told(make_imitation, velocity, is_gait):
     imitation = make_imitation(f"learner.imitation.premium.window={STEPS}")
     _, storage = rollout(imitation, [0.0, 0.0], velocity=velocity)
-    scalars = imitation.update(storage, 0, progress=0.0)
+    scalars = imitation.update(storage, 0)
     assert (scalars["Premium/count_a"] > 0) is is_gait
+
+
+@pytest.mark.parametrize(
+    ("velocity", "share"),
+    [(0.3, 1.0), (0.15, 1.0), (0.06, 0.4), (0.0, 0.0), (-0.3, 0.0)],  # 0.3 m/s is commanded
+)
+def test_a_robot_slower_than_half_of_the_command_earns_in_proportion(
+    make_imitation, velocity, share
+):
+    imitation = make_imitation("learner.imitation.whole_from=[[0,0],[1,0.5]]")
+    standing, _ = rollout(imitation, [0.0, 0.0], velocity=velocity)
+    imitation.set_progress(1.0)
+    late, _ = rollout(imitation, [0.0, 0.0], velocity=velocity)
+    assert standing.min() > 0.5  # at first all of it is paid to everybody
+    torch.testing.assert_close(late, share * standing)
 
 
 def test_the_reward_is_logged_by_skill(make_imitation):
     imitation = make_imitation()
     rewards, storage = rollout(imitation, [0.0, 0.5])
-    scalars = imitation.update(storage, 0, progress=0.0)
+    scalars = imitation.update(storage, 0)
     assert scalars["Imitation/reward_a"] == pytest.approx(rewards[::2].mean().item())
     assert scalars["Imitation/reward_b"] == pytest.approx(rewards[1::2].mean().item())
 
@@ -126,7 +141,7 @@ def test_steps_that_do_not_count_earn_and_teach_nothing(make_imitation):
     for iteration in range(30):
         rewards, storage = rollout(imitation, [0.0, 0.5], valid=False)
         assert not rewards.any()
-        imitation.update(storage, iteration, progress=0.0)
+        imitation.update(storage, iteration)
     with torch.no_grad():
         score = imitation.discriminator(storage.observations[names.IMITATION][0].repeat(1, 2))
     assert score.min() > 0.5  # only experts pull, and they pull up
@@ -143,7 +158,7 @@ def test_what_has_no_noise_is_smooth_as_well(make_imitation, monkeypatch):
     weight = "learner.imitation.discriminator.gradient_penalty=1"
     imitation = make_imitation(weight, noise=0.0)
     _, storage = rollout(imitation, (1.0, 1.0))
-    imitation.update(storage, 0, progress=0.0)
+    imitation.update(storage, 0)
     assert seen and all(features == 2 * [True, True, False, False] for features in seen)
 
 
@@ -156,7 +171,8 @@ def test_the_instance_noise_shrinks_with_progress(make_imitation):
         hook = imitation.discriminator.register_forward_pre_hook(
             lambda _, args, seen=seen: seen.append(args[0].detach())
         )
-        imitation.update(storage, 0, progress)
+        imitation.set_progress(progress)
+        imitation.update(storage, 0)
         hook.remove()
         policy = torch.cat([batch[256:] for batch in seen if len(batch) == 512])
         spreads.append(policy[:, 1].std().item())  # 0.5 in every pair
