@@ -114,8 +114,8 @@ def stance_time(before: torch.Tensor, step: Step) -> torch.Tensor:
 
 
 def swing_peak(before: torch.Tensor, step: Step) -> torch.Tensor:
-    """Remember how high each foot has been in its swing, (N, F), m."""
-    return torch.maximum(before, step.robot.foot_height) * ~step.robot.foot_stands
+    """Remember how high each foot has been in its swing over what lies ahead of it, (N, F), m."""
+    return torch.maximum(before, step.robot.foot_clearance) * ~step.robot.foot_stands
 
 
 @remembering(air_time)

@@ -22,6 +22,7 @@ STANDING = 0.1  # m/s or rad/s; a smaller command asks to stand
 AT_LIMIT = 0.999  # of a torque's limit; the rest is rounding
 CONTACT_FORCE = 1.0  # N; a foot that presses harder than this stands
 PATCH_SPACING = 0.1  # m between the points whose mean is the ground under the base
+AHEAD = (0.0, 0.05, 0.1)  # m before a foot: the highest ground there is what a step has to clear
 SCAN_SHAPE = (9, 7)  # points of the height scan, forward and to the left [paper: 63]
 SCAN_SPACING = 0.1  # m between them
 
@@ -47,6 +48,7 @@ class RobotState:
         self._ground = ground
         self._patch = grid(3, 3, PATCH_SPACING).to(sim.device)
         self._scan = grid(*SCAN_SHAPE, SCAN_SPACING).to(sim.device)
+        self._ahead = torch.tensor([[x, 0.0] for x in AHEAD], device=sim.device)
         self.read_kinematics()
         self._read_contacts()
 
@@ -120,6 +122,16 @@ class RobotState:
         return self._foot_height
 
     @property
+    def foot_clearance(self) -> torch.Tensor:
+        """Height of each foot above the highest ground under it and AHEAD of it, (N, F), m."""
+        if self._ground is None:
+            return self.foot_height
+        points = self._foot_points()[..., None, :2]
+        ahead = rotations.turn(self._ahead, self.yaw)[:, None]  # (N, 1, points, 2)
+        around = self._ground.heights((points + ahead).flatten(1, 2)).unflatten(1, (-1, len(AHEAD)))
+        return self.foot_height + around[..., 0] - around.amax(dim=-1)
+
+    @property
     def yaw(self) -> torch.Tensor:
         """Heading of the base, (N,), rad."""
         return rotations.yaw(self._rotation)
@@ -145,9 +157,12 @@ class RobotState:
         """Return the height of the ground under each foot, (N, F), m; 0 where it is flat."""
         if self._ground is None:
             return torch.zeros_like(self.base_pos_w[:, :1])
+        return self._ground.heights(self._foot_points()[..., :2])
+
+    def _foot_points(self) -> torch.Tensor:
+        """Return the centres of the feet in the world, (N, F, 3), m."""
         pos_b = self._kinematics.foot_pos_b(self.joint_pos)
-        points = self.base_pos_w[:, None] + pos_b @ self._rotation.mT
-        return self._ground.heights(points[..., :2])
+        return self.base_pos_w[:, None] + pos_b @ self._rotation.mT
 
     def _read_contacts(self) -> None:
         record, layout = self._sim.sensor_record, self._layout
