@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from patience import PATIENCE
+from patience import patience
 
 from kiras_rl import distributed
 from kiras_rl.checkpoint import CheckpointError, load_checkpoint, save_checkpoint
@@ -38,7 +38,7 @@ def torchrun(*arguments: str, cwd: Path) -> Iterator[subprocess.Popen]:
         yield process
     finally:
         process.terminate()  # not killed: it ends the ranks first
-        process.communicate(timeout=PATIENCE)
+        process.communicate(timeout=patience())
 
 
 @pytest.fixture(scope="module")
@@ -46,7 +46,7 @@ def folder(tmp_path_factory):
     """Do what tests/ranks.py does, on two ranks; return the folder of the results."""
     out = tmp_path_factory.mktemp("ranks")
     with torchrun(str(Path(__file__).with_name("ranks.py")), str(out), cwd=out) as process:
-        printed, _ = process.communicate(timeout=PATIENCE)
+        printed, _ = process.communicate(timeout=patience())
     assert process.returncode == 0, printed
     (out / "printed.txt").write_text(printed)
     return out
@@ -237,12 +237,12 @@ def test_a_rank_that_dies_ends_the_run_and_leaves_the_checkpoint(tmp_path):
     endless += ["checkpoint_minutes=0"]
     command = ["-m", "kiras_rl.tools.train", "--cfg", "smoke", "--runs", "."]
     with torchrun(*command, *endless, cwd=tmp_path) as process:
-        end = time.monotonic() + PATIENCE
+        end = time.monotonic() + patience()
         while not list(tmp_path.glob("smoke/*/checkpoints/latest.pt")):
             assert process.poll() is None and time.monotonic() < end
             time.sleep(0.1)
         os.kill(pid_of(1, process.pid), signal.SIGKILL)
-        printed, _ = process.communicate(timeout=PATIENCE)
+        printed, _ = process.communicate(timeout=patience())
     assert process.returncode != 0
     assert printed.count("error: ") == 1
     assert "error: rank 0 of 2: another rank died or did not answer" in printed

@@ -7,7 +7,7 @@ import subprocess
 import sys
 
 import pytest
-from patience import PATIENCE
+from patience import patience
 
 from kiras_rl.tools.console import make_console
 from kiras_rl.tools.report.content import Column, Table
@@ -31,4 +31,4 @@ def test_names_in_tables_are_printed_as_they_are(capsys):
 def test_robots_are_loaded_whatever_graphics_there_are(name):
     code = "from kiras_rl.robots.robot import load_robot; import mujoco; load_robot('solo8')"
     environment = os.environ | {"MUJOCO_GL": name}
-    subprocess.run([sys.executable, "-c", code], env=environment, check=True, timeout=PATIENCE)
+    subprocess.run([sys.executable, "-c", code], env=environment, check=True, timeout=patience())
