@@ -27,6 +27,15 @@ def replacing(path: Path) -> Iterator[Path]:
         temporary.unlink(missing_ok=True)
 
 
+def remove_leftovers(folder: Path) -> None:
+    """Remove what `replacing` began in a folder, or below it, in processes that were killed.
+
+    The folder must have no other writer.
+    """
+    for temporary in folder.rglob(".*.tmp"):
+        temporary.unlink(missing_ok=True)
+
+
 class TornFileError(OSError):
     """A file that does not read as it was written."""
 

@@ -103,7 +103,7 @@ def test_a_held_key_walks_and_space_stops(drive, tab):
     cockpit, _ = drive
     choose(cockpit, tab, "1")
     tab.keyboard.down("w")
-    assert wait_for(lambda: cockpit.target[0] > 0.2)
+    assert wait_for(lambda: cockpit.target[0] > 0.4)  # fast enough for it to walk at all
     tab.keyboard.up("w")
     assert wait_for(lambda: mean_of_last(cockpit, "lin_vel_x") > 0.15)
     press(tab, "Space", lambda: not cockpit.target.any())
