@@ -93,7 +93,7 @@ def test_two_ranks_have_the_gradients_of_one_process_with_the_worlds_of_both(
         expected, given = rank["gradients"][phase]
         assert given.keys() == networks
         for name in networks:
-            assert expected[name].abs().max() > 0.05, name
+            assert expected[name].abs().max() > 0.1, name
             torch.testing.assert_close(given[name], expected[name], atol=1e-5, rtol=0, msg=name)
 
 
