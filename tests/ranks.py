@@ -1,4 +1,4 @@
-"""What each rank of test_distributed.py does, started by torchrun with a folder for the results."""
+"""What each rank of test_ranks.py does, started by torchrun with a folder for the results."""
 
 from __future__ import annotations
 

@@ -18,6 +18,8 @@ from kiras_rl.tools.viewer import browser as browsers
 from kiras_rl.tools.viewer.cockpit import Cockpit
 from kiras_rl.tools.viewer.live import open_page
 
+pytestmark = pytest.mark.slow  # a browser that draws on the CPU takes all there is of it
+
 SIZE = {"width": 480, "height": 320}  # drawn on the CPU: the fewer pixels, the sooner
 FRAMES = 8.0  # pictures a second, which a browser without a GPU keeps up with
 
