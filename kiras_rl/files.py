@@ -28,12 +28,13 @@ def replacing(path: Path) -> Iterator[Path]:
 
 
 def remove_leftovers(folder: Path) -> None:
-    """Remove what `replacing` began in a folder, or below it, in processes that were killed.
+    """Remove the files that `replacing` began in a folder, in processes that were killed.
 
     The folder must have no other writer.
     """
-    for temporary in folder.rglob(".*.tmp"):
-        temporary.unlink(missing_ok=True)
+    for temporary in folder.glob(".*.tmp"):
+        if temporary.is_file():
+            temporary.unlink()
 
 
 class TornFileError(OSError):

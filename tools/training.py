@@ -285,7 +285,8 @@ def _telling_what_is_left(run_dir: Path) -> Iterator[None]:
 
 def _begin_folder(runner: KirasRunner) -> None:
     assert runner.run_dir is not None
-    remove_leftovers(runner.run_dir)
+    for folder in (runner.run_dir, runner.run_dir / checkpoint.FOLDER):
+        remove_leftovers(folder)
     save_config(runner.config, runner.run_dir / CONFIG)
 
 

@@ -64,7 +64,7 @@ def commands(place: Path, checkpoint: Path) -> dict[str, list[str]]:
         "export": [str(checkpoint), "--out", str(place / "policy.onnx")],
         "collect": [_POLICY, "--episodes", "1", "--duration", "1", "--out", str(place / "data")],
         "play": [_POLICY, "--script", "walk:1:0.3", "--trace", str(place / "trace.png")],
-        "bench": ["--parts", "inference", "--rounds", "1", "--out", str(place)],
+        "bench": ["--parts", "inference", "--rounds", "1", "--worlds", "16", "--out", str(place)],
     }
 
 
@@ -100,7 +100,7 @@ def try_command(name: str, arguments: list[str], place: Path, size: int) -> list
 def try_training(whole: Path, place: Path, output: Path, size: int) -> list[str]:
     """Let a training run on too small a disk, then on one with room; return the faults."""
     with disk(place, size):
-        problem = wrong_end(train(place, output), _last_line(output))
+        problem = wrong_end(train(place, output), _said(output))
         saved = latest(place)
         if saved:
             load_checkpoint(saved)
@@ -113,9 +113,12 @@ def try_training(whole: Path, place: Path, output: Path, size: int) -> list[str]
     return [f"training, {size} bytes: {x}" for x in found]
 
 
-def _last_line(output: Path) -> str:
-    lines = [line for line in output.read_text().splitlines() if line.startswith("error: ")]
-    return "".join(f"{line}\n" for line in lines)
+def _said(output: Path) -> str:
+    """Return the lines about mistakes, or all where there is a traceback."""
+    text = output.read_text()
+    if "Traceback" in text:
+        return text
+    return "".join(line for line in text.splitlines(True) if line.startswith("error: "))
 
 
 def campaign(disks: int, seed: int = 0) -> list[str]:

@@ -31,14 +31,12 @@ def campaign(kills: int, seed: int = 0) -> list[str]:
         if status := train(whole, output):
             return [f"the undisturbed training ends with {status}: {output.read_text()}"]
         seconds = time.monotonic() - begin
-        left = kills
-        for number in range(kills):
+        number = 0
+        while kills > 0:
+            number += 1
             runs = Path(folder, f"training_{number}")
-            moments = _moments(rng, left, seconds)
-            left -= _disturb(runs, output, moments)
+            kills -= _disturb(runs, output, _moments(rng, kills, seconds))
             faults += [f"training {number}: {x}" for x in _judge(runs, whole, output)]
-            if not left:
-                break
     return faults
 
 
