@@ -27,6 +27,16 @@ def replacing(path: Path) -> Iterator[Path]:
         temporary.unlink(missing_ok=True)
 
 
+def remove_leftovers(folder: Path) -> None:
+    """Remove the files that `replacing` began in a folder, in processes that were killed.
+
+    The folder must have no other writer.
+    """
+    for temporary in folder.glob(".*.tmp"):
+        if temporary.is_file():
+            temporary.unlink()
+
+
 class TornFileError(OSError):
     """A file that does not read as it was written."""
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 
+import patience
 import pytest
 import torch
 from tape import Tape
@@ -41,6 +42,11 @@ def seeded():
 def pytest_runtest_setup(item):
     if item.get_closest_marker("gpu") and not torch.cuda.is_available():
         pytest.skip("needs CUDA")
+
+
+def pytest_runtest_logreport(report):
+    if report.failed:
+        patience.spend(report.duration)
 
 
 @pytest.fixture

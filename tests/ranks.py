@@ -1,4 +1,4 @@
-"""What each rank of test_distributed.py does, started by torchrun with a folder for the results."""
+"""What each rank of test_ranks.py does, started by torchrun with a folder for the results."""
 
 from __future__ import annotations
 
@@ -64,6 +64,7 @@ def collect(phase: str) -> dict:
     alg, world = runner.alg, torch.arange(2 * WORLDS)
     st = alg.storage
     st.dones[::5, :3] = 1
+    st.task_rewards += st.actions.sum(dim=-1, keepdim=True)  # advantages that gradients tell
     if alg.reference:
         st.observations[names.FLAT_ACTION] += torch.randn(STEPS, 2 * WORLDS, 8)  # else no loss
         st.observations[names.IS_FLAT] = (world < 2).expand(STEPS, -1).unsqueeze(-1)

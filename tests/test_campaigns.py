@@ -2,8 +2,22 @@
 
 from __future__ import annotations
 
-from campaigns.mutations import campaign
+import os
+
+import pytest
+from campaigns import disks, kills, mutations
 
 
 def test_damaged_files_are_usable_or_refused_in_one_line():
-    assert campaign(range(3)) == []
+    assert mutations.campaign(range(3)) == []
+
+
+@pytest.mark.slow
+def test_killed_trainings_end_with_the_bits_of_one_that_was_not():
+    assert kills.campaign(5) == []
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(os.geteuid() != 0, reason="mounting a disk takes root")
+def test_a_full_disk_is_one_line_and_what_was_whole_stays_whole():
+    assert disks.campaign(6) == []

@@ -12,6 +12,7 @@ import torch
 
 from kiras_rl import checkpoint
 from kiras_rl.checkpoint import CheckpointError, find_checkpoint, load_checkpoint, save_checkpoint
+from kiras_rl.files import remove_leftovers
 from kiras_rl.models.exported import ExportedPolicy
 
 CONTENT = {"learner": {"weights": torch.arange(1000.0)}, "iteration": 7, "infos": None}
@@ -172,3 +173,12 @@ def test_a_full_disk_is_one_line_and_leaves_the_old_file(saved):
     assert "File too large" in str(caught.value)
     assert saved.read_bytes() == before
     assert [file.name for file in saved.parent.iterdir()] == [saved.name]
+
+
+def test_what_killed_processes_began_is_removed_and_nothing_else(saved):
+    folder = saved.parent
+    (folder / ".latest.pt.123.tmp").write_bytes(b"a part")
+    (folder / ".456.tmp").mkdir()  # a dataset that is being written
+    (folder / ".lock").touch()
+    remove_leftovers(folder)
+    assert sorted(path.name for path in folder.iterdir()) == [".456.tmp", ".lock", "latest.pt"]

@@ -160,6 +160,16 @@ def test_an_empty_folder_may_be_filled_and_a_full_one_not(saved, dataset, tmp_pa
         save_dataset(dataset, tmp_path / "file")
 
 
+def test_an_empty_folder_stays_the_one_that_it_is(dataset, tmp_path):
+    """It may be where another disk is mounted, whose place nothing can take."""
+    volume = tmp_path / "volume"
+    volume.mkdir()
+    before = volume.stat().st_ino
+    save_dataset(dataset, volume)
+    assert volume.stat().st_ino == before
+    assert len(load_dataset(volume).done) == FRAMES
+
+
 @pytest.mark.parametrize("name", FORMATS)
 def test_an_interrupt_leaves_nothing(name, tmp_path):
     class Interrupt:

@@ -39,7 +39,7 @@ def test_every_package_has_an_init_file():
     assert not missing
 
 
-@pytest.mark.parametrize("package", ["kiras_rl.robots", "kiras_rl.cfg"])
+@pytest.mark.parametrize("package", ["kiras_rl.robots", "kiras_rl.cfg", "kiras_rl.tools.viewer"])
 def test_every_data_file_is_covered_by_a_pattern(package):
     folder = FOLDERS[package]
     covered = {path for glob in SETUPTOOLS["package-data"][package] for path in folder.glob(glob)}

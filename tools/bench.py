@@ -20,6 +20,7 @@ from rich.table import Table
 from kiras_rl import checkpoint
 from kiras_rl.config import ConfigError, load_config
 from kiras_rl.deploy.policy import PolicyError
+from kiras_rl.files import replacing
 from kiras_rl.robots.robot import RobotError
 from kiras_rl.schema import Config
 from kiras_rl.tools.arguments import at_least
@@ -38,6 +39,7 @@ from kiras_rl.tools.benchmarks import (
 from kiras_rl.tools.benchmarks.request import Figures, Request
 from kiras_rl.tools.benchmarks.tables import STYLE
 from kiras_rl.tools.ending import finish
+from kiras_rl.tools.outputs import check_output, save_figure
 from kiras_rl.tools.training import resolve_device
 
 DESCRIPTION = """\
@@ -102,6 +104,7 @@ BUSY = 0.5  # mean number of running programs in the last minute
 
 FIGURES, TABLES = "figures.json", "tables.txt"
 """Files in the folder of --out."""
+WRITER = "kiras-bench --out"
 
 console = Console()
 
@@ -168,6 +171,7 @@ def bench(args: argparse.Namespace) -> None:
 
     Raises:
         ConfigError: A configuration that cannot be used.
+        OutputError: A file in the folder of --out that another command has written.
     """
     config = _config(args)
     request = Request(
@@ -178,6 +182,7 @@ def bench(args: argparse.Namespace) -> None:
         peer=args.peer,
         tell=console.print,
     )
+    _check_outputs(args)
     report: dict[str, Figures] = {"machine": _machine(config), "settings": _settings(args)}
     tables = [_facts("machine", report["machine"])]
     console.print(*tables)
@@ -189,11 +194,20 @@ def bench(args: argparse.Namespace) -> None:
         shown = PARTS[name].table(report[name])
         _print(shown, console)
         tables += shown
-        if args.out:
+        if args.out is not None:
             _save(args.out, report, tables)
         if args.plot and hasattr(PARTS[name], "plot"):
             with matplotlib.rc_context(STYLE):
-                PARTS[name].plot(report[name], args.out / f"{name}.png")
+                save_figure(PARTS[name].plot(report[name]), args.out / f"{name}.png", WRITER)
+
+
+def _check_outputs(args: argparse.Namespace) -> None:
+    """Refuse now what would be refused after the measurements."""
+    if args.out is None:
+        return
+    plotted = [f"{name}.png" for name in args.parts if args.plot and hasattr(PARTS[name], "plot")]
+    for name in (FIGURES, TABLES, *plotted):
+        check_output(args.out / name, WRITER)
 
 
 def _config(args: argparse.Namespace) -> Config:
@@ -207,6 +221,7 @@ def _config(args: argparse.Namespace) -> Config:
 
 def _settings(args: argparse.Namespace) -> Figures:
     return {
+        "writer": WRITER,
         "cfg": args.cfg,
         "overrides": args.overrides,
         "worlds": list(args.worlds) or [WORLDS],
@@ -244,8 +259,10 @@ def _facts(title: str, facts: Figures) -> Table:
 
 def _save(folder: Path, report: dict[str, Figures], tables: Iterable[Table]) -> None:
     """Write all figures and tables until now: a part that fails later loses none of them."""
-    (folder / FIGURES).write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
-    with (folder / TABLES).open("w", encoding="utf-8") as file:
+    with replacing(folder / FIGURES) as path:
+        path.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
+    with replacing(folder / TABLES) as path, path.open("w", encoding="utf-8") as file:
+        file.write(f"{WRITER}\n\n")
         _print(tables, _plain(file))
 
 

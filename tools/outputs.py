@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import zipfile
 from pathlib import Path
+from typing import NoReturn
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -33,10 +34,19 @@ def check_output(path: Path, writer: str) -> None:
     if path.is_dir():
         raise OutputError(f"{path} is a folder: name a file")
     if path.exists() and not _carries(path, writer.encode()):
-        raise OutputError(
-            f"{path} is there and was not written by this command: name another file, or remove it"
-        )
+        refuse(path)
     path.parent.mkdir(parents=True, exist_ok=True)
+
+
+def refuse(path: Path) -> NoReturn:
+    """Say that a file is another's.
+
+    Raises:
+        OutputError: Always.
+    """
+    raise OutputError(
+        f"{path} is there and was not written by this command: name another file, or remove it"
+    )
 
 
 def save_figure(figure: Figure, path: Path, writer: str, **options: object) -> None:

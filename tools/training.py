@@ -19,6 +19,7 @@ from kiras_rl.config import ConfigError, check_resume_overrides, config_from_dic
 from kiras_rl.deploy.policy import OnboardPolicy, PolicyError, PolicyMetadata
 from kiras_rl.envs import make_env, resolve_backend
 from kiras_rl.export import ExportError, export_policy
+from kiras_rl.files import remove_leftovers
 from kiras_rl.ownership import owning
 from kiras_rl.phases import (
     FINETUNING,
@@ -284,6 +285,8 @@ def _telling_what_is_left(run_dir: Path) -> Iterator[None]:
 
 def _begin_folder(runner: KirasRunner) -> None:
     assert runner.run_dir is not None
+    for folder in (runner.run_dir, runner.run_dir / checkpoint.FOLDER):
+        remove_leftovers(folder)
     save_config(runner.config, runner.run_dir / CONFIG)
 
 

@@ -1,6 +1,6 @@
 """Damage files at random, by seed, and load them: each is still usable, or refused in one line.
 
-python tests/campaigns/mutations.py [SEEDS]
+PYTHONPATH=tests python -m campaigns.mutations [SEEDS]
 
 Files are those of a robot, a configuration, a checkpoint, a policy and a dataset. Whatever else
 happens, an error of another kind or a message of several lines, is a fault, printed with its seed.

@@ -25,7 +25,7 @@ SMALL = (
 )
 
 
-@pytest.fixture(autouse=True)
+@pytest.fixture(autouse=True, scope="module")
 def one_thread():
     """Leave one thread to torch: on a busy machine two of them mostly wait for each other."""
     threads = torch.get_num_threads()
@@ -152,8 +152,16 @@ def test_the_bound_is_physics_and_the_arithmetic_of_the_update(bench):
     assert "target: at least 0.85" in out
 
 
-def test_a_finer_time_step_is_nearer_to_the_reference(bench, tmp_path):
-    options = bench("--parts=options")[0]["options"]
+@pytest.fixture(scope="module")
+def options(tmp_path_factory):
+    """Return the figures of the options, with one varied, and the tables: measured once."""
+    out = tmp_path_factory.mktemp("options")
+    assert main([*SMALL, f"--out={out}", "--parts=options", "sim.solver_iterations=6"]) == 0
+    return json.loads((out / "figures.json").read_text())["options"], (out / "tables.txt")
+
+
+def test_a_finer_time_step_is_nearer_to_the_reference(options):
+    options, tables = options
     errors, fine = options["errors"], "timestep 0.0025 s x 8"
     assert options["speed"]["configuration"]["median"] == 1.0
     for key in ("base_position", "base_height", "pitch", "foot_force"):
@@ -161,7 +169,16 @@ def test_a_finer_time_step_is_nearer_to_the_reference(bench, tmp_path):
         assert 0.0 < errors[fine][key][0] < errors["configuration"][key][0]
     # what a sphere of 16 mm can do without passing through the ground
     assert 0.0 < errors["configuration"]["penetration"] < 0.016
-    assert "* configuration" in (tmp_path / "tables.txt").read_text()
+    assert "* configuration" in tables.read_text()
+
+
+@pytest.mark.parametrize("name", ["figures.json", "tables.txt", "iteration.png"])
+def test_files_of_others_are_spared_before_anything_is_measured(name, tmp_path, capsys):
+    (tmp_path / name).write_bytes(b"mine")
+    assert main([*SMALL, f"--out={tmp_path}", "--parts=iteration", "--plot"]) == 2
+    out, err = capsys.readouterr()
+    assert out == "" and err.startswith(f"error: {tmp_path / name} is there and was not written by")
+    assert (tmp_path / name).read_bytes() == b"mine"
 
 
 def test_contacts_err_less_the_longer_they_are_searched(bench, monkeypatch, tmp_path):
@@ -199,8 +216,8 @@ def test_options_need_a_policy_that_comes_with_the_robot(capsys, monkeypatch, tm
     assert "no policy comes with go1" in capsys.readouterr().err
 
 
-def test_an_option_is_varied_once_and_the_choice_is_not_repeated(bench):
-    options = bench("--parts=options", "sim.solver_iterations=6")[0]["options"]["options"]
+def test_an_option_is_varied_once_and_the_choice_is_not_repeated(options):
+    options = options[0]["options"]
     assert options["configuration"]["iterations"] == options["configuration"]["ls_iterations"] == 6
     assert "iterations 6" not in options
     assert options["iterations 10"] == options["configuration"] | {"iterations": 10}

@@ -7,7 +7,7 @@ import subprocess
 import sys
 
 import pytest
-from patience import PATIENCE
+from patience import patience
 
 from kiras_rl.tools.console import make_console
 from kiras_rl.tools.report.content import Column, Table
@@ -27,8 +27,20 @@ def test_names_in_tables_are_printed_as_they_are(capsys):
     assert "[red]" in out and "[/x]" in out and "[bold]a" in out
 
 
+@pytest.mark.slow
+def test_a_training_needs_no_graphics(tmp_path):
+    code = "import sys; from kiras_rl.tools.commands import train; sys.exit(train(sys.argv[1:]))"
+    short = ["--cfg", "smoke", "iterations=1", "finetuning=null", "evaluation.interval=0"]
+    done = subprocess.run(
+        [sys.executable, "-c", code, *short, "--runs", str(tmp_path)], check=False, text=True,
+        env=os.environ | {"MUJOCO_GL": "nonsense"}, capture_output=True, timeout=patience(),
+    )  # fmt: skip
+    assert (done.returncode, done.stderr) == (0, "")
+    assert list(tmp_path.glob("smoke/*/policy.onnx"))
+
+
 @pytest.mark.parametrize("name", ["nonsense", "osmesa"])
 def test_robots_are_loaded_whatever_graphics_there_are(name):
     code = "from kiras_rl.robots.robot import load_robot; import mujoco; load_robot('solo8')"
     environment = os.environ | {"MUJOCO_GL": name}
-    subprocess.run([sys.executable, "-c", code], env=environment, check=True, timeout=PATIENCE)
+    subprocess.run([sys.executable, "-c", code], env=environment, check=True, timeout=patience())

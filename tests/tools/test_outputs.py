@@ -55,6 +55,16 @@ def test_an_export_spares_what_is_no_policy_file(tmp_path, capsys):
         assert (tmp_path / name).read_bytes() == b"something else"
 
 
+def test_a_report_spares_tables_that_are_not_its_own(tmp_path):
+    table = tmp_path / "tables" / "flat_errors.csv"
+    table.parent.mkdir()
+    table.write_text("mine")
+    with pytest.raises(OutputError, match="was not written by this command"):
+        check_page(tmp_path)
+    (tmp_path / PAGE).write_text("<title>KiRAS: a policy</title>")  # which they belong to
+    check_page(tmp_path)
+
+
 def test_a_report_spares_another_page(tmp_path):
     check_page(tmp_path)
     (tmp_path / PAGE).write_text("<title>KiRAS: a policy</title>")

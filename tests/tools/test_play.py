@@ -12,7 +12,7 @@ import urllib.request
 import matplotlib.image
 import numpy as np
 import pytest
-from patience import PATIENCE
+from patience import patience
 
 from kiras_rl.robots.robot import load_robot
 from kiras_rl.tools import policy_files, rendering
@@ -30,9 +30,9 @@ def test_the_page_is_served_until_ctrl_c(still_file):
             assert "driving still.onnx: http://127.0.0.1:" in line
             assert "this machine only" in line
             url = re.search(r"http://\S+/", line)[0]
-            assert b"<canvas" in urllib.request.urlopen(url, timeout=PATIENCE).read()
+            assert b"<canvas" in urllib.request.urlopen(url, timeout=patience()).read()
             process.send_signal(signal.SIGINT)
-            out, err = process.communicate(timeout=PATIENCE)
+            out, err = process.communicate(timeout=patience())
         finally:
             process.kill()
     assert (process.returncode, out.strip(), err) == (0, "", "")

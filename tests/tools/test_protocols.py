@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+from types import SimpleNamespace
+
 import pytest
 
-from kiras_rl.tools.protocols import learning, sampling
+from kiras_rl.config import ConfigError
+from kiras_rl.tools.evaluate import chosen
+from kiras_rl.tools.protocols import learning, sampling, transitions
 from kiras_rl.tools.protocols.crossing import percent, pooled, wilson
 from kiras_rl.tools.protocols.pooling import pool
 
@@ -97,3 +102,22 @@ def test_what_one_seed_lacks_is_the_others():
     curve = {"mean": [1.0], "low": [0.0]}
     assert pool([{"height": curve}, {}]) == {"height": curve}
     assert pool([{"height": curve}, {"height": None}]) == {"height": curve}
+
+
+def one_skill():
+    """Return a subject that walks and can do nothing else, and has no run."""
+    return SimpleNamespace(
+        skills=("walk",), label="mine", is_finetuned=False, source=Path("mine.onnx")
+    )
+
+
+def test_a_robot_of_one_skill_is_measured_by_all_that_needs_no_second_one():
+    names = chosen(None, [one_skill()])
+    assert "transitions" not in names
+    assert {"flat", "imitation", "limits"} <= set(names)
+
+
+def test_transitions_of_one_skill_are_refused_where_they_are_named():
+    assert chosen(["transitions"], [one_skill()]) == ["transitions"]
+    with pytest.raises(ConfigError, match="mine has walk alone: name other protocols with"):
+        transitions.measure(one_skill())

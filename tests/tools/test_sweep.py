@@ -11,7 +11,7 @@ import sys
 
 import pytest
 import torch
-from patience import PATIENCE
+from patience import patience
 
 from kiras_rl.checkpoint import load_checkpoint
 from kiras_rl.config import list_configs, load_config
@@ -209,7 +209,7 @@ def test_stopped_jobs_save(number, tmp_path):
             if len(started) == int(jobs):
                 break
         process.send_signal(number)
-        out, err = process.communicate(timeout=PATIENCE)
+        out, err = process.communicate(timeout=patience())
     finally:
         process.kill()
     assert (process.returncode, err) == (0, "")

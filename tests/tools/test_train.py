@@ -12,7 +12,7 @@ import matplotlib.image
 import onnx
 import pytest
 import torch
-from patience import PATIENCE
+from patience import patience
 
 from kiras_rl.checkpoint import find_checkpoint, load_checkpoint, load_policy, save_checkpoint
 from kiras_rl.config import load_config
@@ -232,7 +232,7 @@ def test_a_terminated_training_saves_and_goes_on(tmp_path, capsys):
             if "/100000 |" in line:  # the first iteration is done
                 break
         process.send_signal(signal.SIGTERM)
-        out, err = process.communicate(timeout=PATIENCE)
+        out, err = process.communicate(timeout=patience())
     finally:
         process.kill()
     assert (process.returncode, err) == (0, "")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from statistics import median
 
 from matplotlib import colormaps
@@ -106,8 +105,8 @@ def _parts_of(figures: Figures) -> list[str]:
     return [part for part in (*named, REST) if part in present]
 
 
-def plot(figures: Figures, path: Path) -> None:
-    """Draw a bar of an iteration's parts for each phase."""
+def plot(figures: Figures) -> Figure:
+    """Return a bar of an iteration's parts for each phase."""
     phases = figures["seconds"]
     figure = Figure(figsize=(11, 1.9 + 0.8 * len(phases)), layout="constrained")
     axes = figure.subplots()
@@ -124,7 +123,7 @@ def plot(figures: Figures, path: Path) -> None:
     handles, labels = axes.get_legend_handles_labels()
     legend = dict(zip(labels, handles, strict=True))
     figure.legend(legend.values(), legend, loc="outside lower center", ncols=5, frameon=False)
-    figure.savefig(path)
+    return figure
 
 
 def _stack(

@@ -216,8 +216,8 @@ def _memory_of_a_world(size: Figures, before: Figures | None) -> str:
     return f"{grown / (size['worlds'] - before['worlds']) / 1e3:.1f}"
 
 
-def plot(figures: Figures, path: Path) -> None:
-    """Draw speed and memory against worlds."""
+def plot(figures: Figures) -> Figure:
+    """Return speed and memory against worlds."""
     figure = Figure(figsize=(9, 3.6), layout="constrained")
     speed, memory = figure.subplots(1, 2)
     worlds = [size["worlds"] for size in figures["sizes"]]
@@ -238,4 +238,4 @@ def plot(figures: Figures, path: Path) -> None:
         axes.set_xlabel("worlds")
         axes.grid(alpha=0.3)
     figure.suptitle(f"{figures['robot']}, {figures['backend']} on {figures['device']}")
-    figure.savefig(path)
+    return figure

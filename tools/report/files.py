@@ -11,10 +11,12 @@ from pathlib import Path
 from jinja2 import Environment, StrictUndefined
 from markupsafe import Markup
 
-from kiras_rl.tools.outputs import check_output
+from kiras_rl.files import replacing
+from kiras_rl.tools.outputs import check_output, refuse
 from kiras_rl.tools.report.content import Figure, Section, Table
 
 PAGE = "report.html"
+TABLES = "tables"
 TEMPLATE = "page.html.j2"
 
 
@@ -31,28 +33,33 @@ def write_report(folder: Path, title: str, about: Table, sections: list[Section]
         The page.
 
     Raises:
-        OutputError: There is another page.
+        OutputError: As `check_page`.
     """
     check_page(folder)
-    tables = folder / "tables"
-    tables.mkdir(parents=True, exist_ok=True)
+    page = folder / PAGE
+    _write(page, as_html(title, about, sections))  # first: it tells whose the tables are
     for section in sections:
         for table in section.tables:
-            (tables / f"{section.name}_{slug(table.title)}.csv").write_text(
-                as_csv(table), encoding="utf-8"
-            )
-    page = folder / PAGE
-    page.write_text(as_html(title, about, sections), encoding="utf-8")
+            _write(folder / TABLES / f"{section.name}_{slug(table.title)}.csv", as_csv(table))
     return page
 
 
+def _write(path: Path, text: str) -> None:
+    with replacing(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
 def check_page(folder: Path) -> None:
-    """Refuse a folder with another page; call it before the work.
+    """Refuse a folder with another page, or with tables that belong to none; before the work.
 
     Raises:
-        OutputError: There is one.
+        OutputError: There is one. A CSV file cannot carry whose it is: the page beside it does.
     """
-    check_output(folder / PAGE, "<title>KiRAS: ")
+    page = folder / PAGE
+    check_output(page, "<title>KiRAS: ")
+    if not page.exists():
+        for table in (folder / TABLES).glob("*.csv"):
+            refuse(table)
 
 
 def as_html(title: str, about: Table, sections: list[Section]) -> str:

@@ -9,20 +9,8 @@ from __future__ import annotations
 
 import ipaddress
 import socket
-from collections.abc import Callable
-from functools import cache, wraps
-from typing import Any
+from functools import cache
 from urllib.parse import urlsplit
-
-from mujoco.studio.web import web_server
-
-_FORBIDDEN = 403
-
-
-def install() -> None:
-    """Let the web server of MuJoCo Studio ask `is_allowed` first; once is enough."""
-    if not hasattr(web_server.serve, "__wrapped__"):
-        web_server.serve = _guarded(web_server.serve)
 
 
 def is_allowed(host: str | None, origin: str | None) -> bool:
@@ -48,17 +36,3 @@ def _is_address(host: str) -> bool:
     except ValueError:
         return False
     return True
-
-
-def _guarded(serve: Callable[..., Any]) -> Callable[..., Any]:
-    @wraps(serve)
-    def serve_own(*args: Any, process_request: Callable[..., Any], **options: Any) -> Any:
-        def ask_first(connection: Any, request: Any) -> Any:
-            if is_allowed(request.headers.get("Host"), request.headers.get("Origin")):
-                return process_request(connection, request)
-            text = "This page answers its own scripts, by an address or name of its machine.\n"
-            return connection.respond(_FORBIDDEN, text)
-
-        return serve(*args, process_request=ask_first, **options)
-
-    return serve_own

@@ -8,7 +8,7 @@ import sys
 import threading
 import time
 import webbrowser
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
@@ -20,8 +20,10 @@ from kiras_rl.tools.viewer import LOOPBACK
 from kiras_rl.tools.viewer.browser import open_browser
 from kiras_rl.tools.viewer.choices import newest_checkpoint
 from kiras_rl.tools.viewer.cockpit import FORWARD, Cockpit
+from kiras_rl.tools.viewer.detail import LEVELS, Detail, Level
 from kiras_rl.tools.viewer.page import Page
 from kiras_rl.tools.viewer.panel import Panel
+from kiras_rl.tools.viewer.server import Channel
 from kiras_rl.tools.viewer.session import Session
 from kiras_rl.tools.viewer.stage import Stage
 from kiras_rl.tools.viewer.terminal import Terminal, open_screen
@@ -40,20 +42,29 @@ def open_page(
     port: int = 0,
     follow: Path | None = None,
     rate: float = 60.0,
+    levels: Sequence[Level] = LEVELS,
 ) -> Iterator[tuple[Page, Session]]:
     """Serve a cockpit as a page; the session is there to be run.
+
+    Args:
+        cockpit: What is driven.
+        host: Address to listen on.
+        port: Port to listen on; 0 takes a free one.
+        follow: Run whose checkpoints are loaded as they appear.
+        rate: Most pictures a second.
+        levels: How much may be drawn, from most to least; later ones where pictures are slow.
 
     Raises:
         PageError: If the address or the port cannot be had.
         PolicyError: If what is to be followed is not a run.
     """
-    view = View()
+    view = View(detail=Detail(levels))
     stage = Stage(cockpit.driver)
-    page = Page(Panel(cockpit, view), host, port, rate)
+    page = Page(Panel(cockpit, view), Channel(cockpit, view), host, port, rate)
 
     def show() -> None:
         nonlocal stage
-        stage = stage.move_to(cockpit.driver)
+        stage = stage.move_to(cockpit.driver, view.detail.level.plain)
         stage.pose(view.side)
         page.show(stage)
         page.check()
@@ -121,7 +132,13 @@ def save_screenshot(cockpit: Cockpit, path: Path, speed: float) -> None:
         BrowserError: If there is no Chromium, or the package that steers it is missing.
     """
     check_output(path, SCREENSHOT)
-    with open_browser() as browser, open_page(cockpit, rate=_SLOW) as (page, session):
+    with (
+        open_browser() as browser,
+        open_page(cockpit, rate=_SLOW, levels=LEVELS[:1]) as (
+            page,
+            session,
+        ),
+    ):
         loop = threading.Thread(target=session.run, daemon=True)
         loop.start()
         tab = browser.new_page(viewport=_WINDOW)

@@ -14,7 +14,7 @@ import mujoco
 import numpy as np
 from mujoco.studio import endpoints, launch_thread, messages, viewer_protocol, web_viewer
 
-from kiras_rl.tools.viewer import LOOPBACK, LiveError, guard
+from kiras_rl.tools.viewer import LOOPBACK, LiveError, server
 from kiras_rl.tools.viewer.panel import Panel
 from kiras_rl.tools.viewer.stage import Stage
 
@@ -36,12 +36,18 @@ class Page:
     """
 
     def __init__(
-        self, panel: Panel, host: str = LOOPBACK, port: int = 0, rate: float = 60.0
+        self,
+        panel: Panel,
+        channel: server.Channel,
+        host: str = LOOPBACK,
+        port: int = 0,
+        rate: float = 60.0,
     ) -> None:
         """Start to serve.
 
         Args:
             panel: What is drawn over the scene.
+            channel: What hears keys.
             host: Address to listen on.
             port: Port to listen on; 0 takes a free one.
             rate: Most pictures a second; a browser that draws fewer falls behind by and by.
@@ -52,7 +58,7 @@ class Page:
         port = _free_port(host, port)
         self.url = f"http://{_reachable(host)}:{port}/"
         self._stage: Stage | None = None
-        self._panel = panel
+        self._panel, self._channel = panel, channel
         self._viewer_end, self._end = launch_thread.make_thread_endpoints()
         self._ready = threading.Event()
         self._failure: BaseException | None = None
@@ -90,7 +96,7 @@ class Page:
         logging.getLogger("WebServer").setLevel(logging.WARNING)  # who comes and goes
         try:
             with contextlib.redirect_stdout(io.StringIO()):  # its banner; ours is one line
-                viewer = _Viewer(host, port, rate, self._viewer_end, self._panel)
+                viewer = _Viewer(host, port, rate, self._viewer_end, self._panel, self._channel)
             self._ready.set()
             viewer_protocol.run_viewer_loop(viewer)
         except BaseException as error:  # given to the thread that asks
@@ -108,8 +114,9 @@ class _Viewer(web_viewer.WebViewer):
         rate: float,
         endpoint: endpoints.ViewerEndpoint,
         panel: Panel,
+        channel: server.Channel,
     ) -> None:
-        guard.install()
+        self._channel = channel
         self._chosen_host, self._period, self._last = host, 1 / rate, 0.0
         config = viewer_protocol.ViewerConfig(title="KiRAS", gfx="web", http_port=port)
         super().__init__(config, endpoint, plugins=[panel])
@@ -121,6 +128,10 @@ class _Viewer(web_viewer.WebViewer):
     @_host.setter
     def _host(self, _: str) -> None:
         """Drop what the base class asks for: all interfaces."""
+
+    def _start_server(self) -> None:
+        server.attach(self._http_sock, self._channel)
+        super()._start_server()
 
     def prepare_next_frame(self) -> bool:
         """Start a picture when a browser wants one, and not before its time."""

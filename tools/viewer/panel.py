@@ -15,17 +15,15 @@ from kiras_rl.tools.viewer.view import View
 
 _CONTROLS, _PLOTS, _GAP = 264.0, 304.0, 12.0  # pixels: two windows' widths, and around them
 _HEIGHT, _PLOT_HEIGHT = 740.0, 172.0
-_HOLD = 0.15  # s until a key that is not seen any more counts as let go
 _AXIS_KEYS = {FORWARD: "W S", LEFT: "Q E", YAW: "A D"}
 _UNITS = {FORWARD: "m/s", LEFT: "m/s", YAW: "rad/s"}
 _TRACKING = int(mujoco.mjtCamera.mjCAMERA_TRACKING)
 _FREE = int(mujoco.mjtCamera.mjCAMERA_FREE)
 _BASE_BODY = 1  # the robot's comes first, the ghost's follow
-_KEYS = {"Up": "UpArrow", "Down": "DownArrow", "Left": "LeftArrow", "Right": "RightArrow"}
 
 
 class Panel(plugin.ViewerPlugin):
-    """Draws the controls, and turns keys into what the cockpit does.
+    """Draws the controls; the keys are heard elsewhere, at once, and not once a picture.
 
     It runs in the page's thread: it reads the cockpit and posts to it.
     """
@@ -54,10 +52,9 @@ class Panel(plugin.ViewerPlugin):
 
     @messages.handler
     def on_frame(self, event: messages.BuildGuiEvent) -> None:
-        """Draw everything once, and listen to the keys."""
+        """Draw everything once."""
         self._aim()
-        if not imgui.GetIO().WantCaptureKeyboard:
-            self._listen()
+        self.view.typing = imgui.GetIO().WantCaptureKeyboard
         size = imgui.GetIO().DisplaySize
         with widgets.look():
             most = min(size.y - 2 * _GAP, _HEIGHT)
@@ -71,20 +68,6 @@ class Panel(plugin.ViewerPlugin):
         viewer.camera.type = _TRACKING if follow else _FREE
         viewer.camera_index = ux.TRACKING_CAMERA_IDX if follow else ux.TUMBLE_CAMERA_IDX
         viewer.vis_options.geomgroup[GHOST_GROUP] = int(self.view.ghost != "off")
-
-    def _listen(self) -> None:
-        post, pressed = self.cockpit.post, imgui.IsKeyPressed
-        for name, (axis, direction) in bindings.HELD.items():
-            if imgui.IsKeyDown(getattr(imgui.Key, _KEYS.get(name, name))):
-                post(self.cockpit.hold, axis, direction, _HOLD)
-        for name in (*bindings.PRESSED, *"123456789"):
-            key = getattr(imgui.Key, f"N{name}" if name.isdigit() else name)
-            if pressed(key, False):
-                bindings.press(self.cockpit, name)
-        if pressed(imgui.Key.G, False):
-            self.view.next_ghost()
-        if pressed(imgui.Key.C, False):
-            self.view.follow = not self.view.follow
 
     # --- left: controls --------------------------------------------------------------------------
 
@@ -146,7 +129,8 @@ class Panel(plugin.ViewerPlugin):
         imgui.Spacing()
         crossings = "" if cockpit.tile.is_flat else f"    crossed {cockpit.crossings}"
         widgets.faint(f"real time {self.view.real_time:.2f} x    falls {cockpit.falls}{crossings}")
-        for text in (self.view.gamepad, cockpit.notice):
+        slow = "pictures are slow here: fewer details" if self.view.detail.is_reduced else ""
+        for text in (slow, self.view.gamepad, cockpit.notice):
             if text:
                 widgets.faint(text)
 

@@ -16,6 +16,8 @@ _COLOUR = (0.20, 0.62, 0.95, 0.30)
 _COLLISION_GROUP = 3
 _SUN, _GROUND = 3.0, 0.62  # times the light and the colours of the scene
 _SKY = 64  # pixels
+_SHADOWS = 256  # pixels
+_EFFECTS = ("filament.ao.enabled", "filament.bloom.enabled")  # as the page's renderer calls them
 
 
 class Stage:
@@ -29,20 +31,27 @@ class Stage:
         data: Its state.
     """
 
-    def __init__(self, driver: Driver) -> None:
-        """Copy the scene, with its names and looks, and add the ghost."""
-        self.driver = driver
+    def __init__(self, driver: Driver, plain: bool = False) -> None:
+        """Copy the scene, with its names and looks, and add the ghost.
+
+        Args:
+            driver: Whose scene.
+            plain: Whether to leave out what makes pictures slow.
+        """
+        self.driver, self._plain = driver, plain
         spec = driver.spec.copy()
         spec.worldbody.add_frame().attach_body(_ghost(driver), _PREFIX, "")
         _dress(spec)
+        if plain:
+            _simplify(spec)
         self.model = spec.compile()
         self.data = mujoco.MjData(self.model)
         self._own, self._scene = driver.model.nq, driver.scene
 
-    def move_to(self, driver: Driver) -> Stage:
-        """Return the stage of a driver as it is now: this one if robot and ground are the same."""
-        if driver.scene != self._scene:
-            return Stage(driver)
+    def move_to(self, driver: Driver, plain: bool = False) -> Stage:
+        """Return the stage of a driver as it is now: this one if all that is seen is the same."""
+        if (driver.scene, plain) != (self._scene, self._plain):
+            return Stage(driver, plain)
         self.driver = driver
         return self
 
@@ -96,6 +105,16 @@ def _dress(spec: mujoco.MjSpec) -> None:
     for colour in ("rgb1", "rgb2", "markrgb"):
         setattr(ground, colour, _GROUND * getattr(ground, colour))
     sky.width, sky.height = _SKY, 6 * _SKY
+
+
+def _simplify(spec: mujoco.MjSpec) -> None:
+    """Leave out what takes a renderer on a CPU most of its time."""
+    for light in spec.lights:
+        light.castshadow = False
+    spec.visual.quality.shadowsize = _SHADOWS  # a map is drawn all the same
+    spec.visual.quality.offsamples = 0
+    for effect in _EFFECTS:
+        spec.add_numeric(name=effect, data=[0], size=1)
 
 
 def _ghost(driver: Driver) -> mujoco.MjsBody:

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
+from kiras_rl.tools.viewer.detail import Detail
+
 GHOSTS = {"off": 0.0, "inside": 0.0, "beside": 0.45}
 """Where the ghost stands: m to the left of the robot."""
 
@@ -33,10 +35,14 @@ class View:
 
     ghost: str = "inside"
     follow: bool = True
+    typing: bool = False
+    """Whether keys go into a field of the page."""
     real_time: float = 1.0
     """Simulated seconds in a second, over the last ones, at full speed."""
     gamepad: str = ""
     selectors: list[Selector] = field(default_factory=list)
+    detail: Detail = field(default_factory=Detail)
+    """How much is drawn."""
 
     @property
     def side(self) -> float:

@@ -8,7 +8,7 @@ import threading
 import time
 
 import pytest
-from patience import PATIENCE
+from patience import patience
 
 from kiras_rl.checkpoint import save_checkpoint
 from kiras_rl.deploy.policy import OnboardPolicy, PolicyError
@@ -36,7 +36,7 @@ def write(run, name, when, content=b""):
 
 
 def wait_for(loader):
-    end = time.monotonic() + PATIENCE
+    end = time.monotonic() + patience()
     while time.monotonic() < end:
         if loaded := loader.poll():
             return loaded
@@ -158,7 +158,7 @@ def test_a_followed_run_gives_its_newest_policy_to_the_running_robot(
             "description": metadata.to_dict(),
         },
     )
-    end = time.monotonic() + PATIENCE
+    end = time.monotonic() + patience()
     loop = threading.Thread(target=session.run)
     loop.start()
     while not (cockpit.notice and cockpit.driver.time > 1.0) and time.monotonic() < end:

@@ -89,3 +89,17 @@ def test_another_ground_is_another_scene_with_the_terrain_in_it(still_file):
     assert stage is not flat
     assert stage.model.ngeom > flat.model.ngeom
     assert stage.move_to(driver) is stage
+
+
+def test_a_plain_stage_leaves_out_what_is_slow_and_moves_alike(still_file):
+    driver = Driver(OnboardPolicy(still_file))
+    stage = Stage(driver)
+    assert stage.model.light_castshadow.any()
+    assert stage.move_to(driver) is stage
+    plain = stage.move_to(driver, plain=True)
+    assert plain is not stage
+    assert not plain.model.light_castshadow.any()
+    assert plain.move_to(driver, plain=True) is plain
+    for each in (stage, plain):
+        each.pose()
+    np.testing.assert_array_equal(plain.data.qpos, stage.data.qpos)

@@ -11,7 +11,7 @@ import sys
 import time
 
 import pytest
-from patience import PATIENCE
+from patience import patience
 
 from kiras_rl.deploy.policy import OnboardPolicy
 from kiras_rl.tools.ground import Tile
@@ -38,7 +38,7 @@ def play(still_file):
 
 
 def read_until(master, pattern):
-    seen, end = "", time.monotonic() + PATIENCE
+    seen, end = "", time.monotonic() + patience()
     while not re.search(pattern, seen) and time.monotonic() < end:
         if select.select([master], [], [], 0.1)[0]:
             seen += os.read(master, 65536).decode(errors="replace")
@@ -51,7 +51,7 @@ def test_keys_drive_and_x_leaves(play):
     os.write(master, b"3")
     read_until(master, r"\x1b\[3[;d]")  # curses sends what changes: here the line of the skills
     os.write(master, b"x")
-    assert process.wait(timeout=PATIENCE) == 0
+    assert process.wait(timeout=patience()) == 0
     assert process.stderr.read() == ""
 
 
@@ -59,7 +59,7 @@ def test_ctrl_c_ends_it_cleanly(play):
     master, process = play
     read_until(master, r"\[1 walk\]")
     process.send_signal(2)
-    assert process.wait(timeout=PATIENCE) == 0
+    assert process.wait(timeout=patience()) == 0
     assert process.stderr.read() == ""
 
 
