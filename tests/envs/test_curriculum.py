@@ -61,11 +61,10 @@ def end(curriculum, worlds, *, fallen=(), crossed=(), skill=0, times=1):
 
 
 def test_types_are_dealt_by_their_proportions(curriculum, library):
+    counts = torch.bincount(make(library, worlds=1000).kind, minlength=len(library.types))
+    assert counts.tolist() == [150, 100, 200, 200, 200, 150, 0, 0, 0, 0]
     names = [library.types[k] for k in curriculum.kind.tolist()]
-    assert names == [
-        "flat", "slopes", "slopes", "bars", "bars", "footholds", "footholds",
-        "stairs_up", "stairs_up", "stairs_down",
-    ]  # fmt: skip
+    assert names[0] == "flat" and names[3] == "bars"  # as the tests below have it
 
 
 def test_every_skill_begins_at_the_lowest_level_of_every_type(curriculum, library):
