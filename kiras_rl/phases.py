@@ -21,7 +21,8 @@ def phase_config(config: Config, phase: str) -> Config:
     """Return the configuration of one phase alone; `iterations` is its length.
 
     Skill learning is the run without finetuning. Finetuning has the changes that the run asks for
-    and no self-imitation: neither a discriminator nor the critic of its reward.
+    and no self-imitation: neither a discriminator nor the critic of its reward. What the run leaves
+    out of the learner stays out.
 
     Raises:
         ConfigError: A change of finetuning to a key that does not exist, or of the wrong type.
@@ -30,7 +31,12 @@ def phase_config(config: Config, phase: str) -> Config:
     if phase == SKILL_LEARNING or config.finetuning is None:
         return config_from_layers([values, {"finetuning": None}], "the saved configuration")
     finetuning = config.finetuning
-    changes = {name: getattr(finetuning, name) for name in ("sim", "env", "learner")}
+    left_out = {name for name, part in values["learner"].items() if part is None}
+    changes = {
+        "sim": finetuning.sim,
+        "env": finetuning.env,
+        "learner": {k: v for k, v in finetuning.learner.items() if k not in left_out},
+    }
     alone = {
         "iterations": finetuning.iterations,
         "learner": {"imitation": None, "multi_critic": None},

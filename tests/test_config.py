@@ -137,7 +137,7 @@ def test_what_an_earlier_version_saved_is_read(overrides):
 def test_what_an_earlier_version_saved_of_finetuning_is_read():
     config = load_config("solo8")
     values = config_to_dict(config)
-    values["finetuning"]["learner"]["estimator"] = {"learning_rate": 1e-3}
+    values["finetuning"]["learner"]["estimator"]["learning_rate"] = 1e-3
     assert phase_config(config_from_dict(values), FINETUNING) == phase_config(config, FINETUNING)
 
 
@@ -262,7 +262,7 @@ def test_the_largest_seed_is_one_of_torch():
     assert env.num_envs == 1
 
 
-@pytest.mark.parametrize("key", RANGES)
+@pytest.mark.parametrize("key", [key for key in RANGES if not key.startswith("env.terrain.")])
 def test_a_range_begins_with_its_lower_end(key):
     message = refusal("solo8", [f"{key}=[4,3]"])
     assert message.startswith(f"{key}=[4")
@@ -333,6 +333,7 @@ def test_of_every_group_of_terms_one_is_left(key):
         ("env.terrain.seed=-1", f"allowed are 0 to {2**63 - 1}"),
         ("env.terrain.types.stairs_up.proportion='abc'", "must be a number"),
         ("env.rewards.terms.torques.weight='abc'", "must be a number"),
+        ("env.terrain.task.lin_vel_x=[0.6, 0.3]", "give [low, high], the lower number first"),
         ("env.commands.lin_vel_x=[0.6, 0.3]", "give [low, high], the lower number first"),
         ("learner.ppo.learning_rate=-1.0", "allowed are 0 to 10"),
     ],

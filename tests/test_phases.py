@@ -66,6 +66,8 @@ def test_finetuning_has_its_changes_and_no_imitation():
 def test_the_paper_s_rewards_hold_in_both_phases():
     paper = load_config("paper")
     flat, rough = (phase_config(paper, phase) for phase in (SKILL_LEARNING, FINETUNING))
+    for rewards in (flat.env.rewards, rough.env.rewards):
+        rewards.terms = {name: values for name, values in rewards.terms.items() if values}
     assert rough.env.rewards == flat.env.rewards
     assert paper.finetuning.retention.flat_loss_weight == 0
 
