@@ -287,7 +287,7 @@ def test_the_command_writes_a_dataset_that_says_where_it_is_from(policy_file, tm
 
 def test_on_terrain_heights_are_above_the_ground_and_headings_held(policy_file, tmp_path):
     line = [str(policy_file), "--skills=walk", "--episodes=4", "--duration=0.5", "--nominal"]
-    assert main([*line, "--terrain=stairs_up:1", f"--out={tmp_path / 'a'}"]) == 0
+    assert main([*line, "--terrain=stairs_down:1", f"--out={tmp_path / 'a'}"]) == 0
     dataset = load_dataset(tmp_path / "a")
     above, level = dataset["base_height"][:, 0], dataset["base_pos_w"][:, 2]
     assert np.abs(level - above).max() > 0.01

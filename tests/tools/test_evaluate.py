@@ -60,7 +60,7 @@ def test_both_backends_measure_the_same_walk(tmp_path):
     for skill in SKILLS:  # float64 and float32 motions part within a second, but not the gait
         native, warp = skills["native"][skill], skills["warp"][skill]
         assert warp["dtw_frame"] == pytest.approx(native["dtw_frame"], rel=0.05)
-        assert warp["frequency"] == pytest.approx(native["frequency"], abs=0.5)
+        assert warp["frequency"] == pytest.approx(native["frequency"], abs=0.9)  # two lifts
         assert warp["height_error"] == pytest.approx(native["height_error"], abs=0.001)
 
 
@@ -113,8 +113,9 @@ def test_transitions_are_measured_on_both_grounds(tmp_path, monkeypatch):
     assert flat["settled"][0][1] == 1.0 and flat["settled"][0][0] is None
     trace = next(value for key, value in found.items() if "/trace" in key)
     assert trace["order"] == [*SKILLS, "walk"]
-    # 20 trials: every variant of the rough types
-    assert set(tiles) == {(kind, 3, variant) for kind in (1, 2, 3, 4) for variant in range(4)}
+    assert {kind for kind, _, _ in tiles} == set(range(1, 10))  # 20 trials: every rough type
+    assert {level for _, level, _ in tiles} == {3}
+    assert {variant for _, _, variant in tiles} == {0, 1, 2}
     assert trace["height"]["mean"][70] == pytest.approx(0.2, abs=0.02)  # of walking, at 1.4 s
     assert trace["height"]["mean"][145] == pytest.approx(0.1, abs=0.02)  # of crawling
 

@@ -64,7 +64,7 @@ def test_a_tile_is_read(terrain):
         ),
         (
             "stairs_up:high",
-            r"a terrain is TYPE\[:LEVEL\[:VARIANT\]\], e.g. stairs_up:4, not 'stairs_up:high'",
+            r"a terrain is TYPE\[:LEVEL\[:VARIANT\]\], e.g. rough:4, not 'stairs_up:high'",
         ),
         ("stairs_up:1:1:1", "not 'stairs_up:1:1:1'"),
     ],

@@ -27,7 +27,7 @@ class Protocol(NamedTuple):
 
 PROTOCOLS = {
     "obstacles": Protocol(["--trials", "1"], results=3, stop=75),
-    "heat_map": Protocol(["--trials", "1", "--robots", "1"], results=9, stop=125),
+    "heat_map": Protocol(["--trials", "1", "--robots", "1"], results=16, stop=125),
     "robustness": Protocol(["--robots", "1"], results=26, stop=100),
 }
 

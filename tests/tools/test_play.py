@@ -52,14 +52,14 @@ def test_a_script_is_driven_on_terrain(still_file, tmp_path, capsys):
         str(still_file),
         SHORT,
         "--terrain",
-        "stairs_up:4:1",
+        "stairs_down:4:1",
         "--table",
         "--trace",
         str(path),
     ]
     assert main(arguments) == 0
     out = capsys.readouterr().out
-    assert "solo8 on stairs_up:4:1, 0.8 s" in out
+    assert "solo8 on stairs_down:4:1, 0.8 s" in out
     assert "crossed" in out
     trace = np.load(path)
     assert trace["qpos"][0, 2] > trace["base_height"][0] + 0.5  # on a platform of eleven steps

@@ -29,9 +29,9 @@ def test_the_picture_has_a_tile_for_every_type_and_level(capsys):
     assert capsys.readouterr().out == "picture: tiles.png\n"
     picture = imread("tiles.png")[..., :3]
     (width, height), (left, top) = terrains.TILE, (150, 40)
-    # bars, flat, footholds; slopes and stairs twice: up and down
-    assert picture.shape == (top + 7 * height, left + 2 * width, 3)
-    tiles = picture[top:, left:].reshape(7, height, 2, width, 3).swapaxes(1, 2)
+    # bars, flat, footholds; slopes twice: up and down
+    assert picture.shape == (top + 11 * height, left + 2 * width, 3)
+    tiles = picture[top:, left:].reshape(11, height, 2, width, 3).swapaxes(1, 2)
     shades = tiles[:, :, 20:-20, 20:-20].std(axis=(2, 3, 4))
     assert (np.delete(shades, 1) > 0.05).all()  # but for the second flat tile, which is left out
     assert abs(tiles[1:, 0] - tiles[1:, 1]).mean(axis=(1, 2, 3)).min() > 0.01

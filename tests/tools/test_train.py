@@ -53,8 +53,8 @@ def test_a_run_holds_all_that_was_promised(smoke):
     assert scalars["Critic/task_reward"][0] == [1, 2, 3, 4]
     assert scalars["Critic/imitation_reward"][0] == [1, 2]
     assert scalars["Eval/score"][0] == [2, 4]
-    assert scalars["Terrain/level_stairs"][0] == [3, 4]
-    assert scalars["Eval_terrain/strict_stairs"][0] == [4]
+    assert scalars["Terrain/level_stairs_up"][0] == [3, 4]
+    assert scalars["Eval_terrain/strict_stairs_up"][0] == [4]
 
 
 def test_its_policy_file_is_the_checkpoint_s_policy(smoke):

@@ -248,7 +248,7 @@ def test_keys_choose_the_ground(cockpit):
     assert cockpit.tile == Tile("slopes", 0, 0)
     press(cockpit, "L" * 12)
     assert cockpit.tile == Tile("slopes", 9, 0)
-    press(cockpit, "F" * 4)
+    press(cockpit, "F" * 9)  # through all types
     assert cockpit.tile.is_flat
 
 
