@@ -3,7 +3,8 @@
 A term's value is positive and its weight in the YAML gives the sign; only `feet_drag` is negative,
 for the paper gives it a positive weight. The paper's table is cfg/paper.yaml.
 
-A weight is a number, or a schedule of [share of the phase, weight] points.
+A weight is a number, or a schedule of [share of the phase, weight] points. `penalty_scale` lets the
+negative ones grow over a phase, but for terms that are `whole: true`.
 
 Terms of the gait judge a foot when it lands or lifts off, from what is remembered of its swing or
 stance (kiras_rl.envs.memory), and leave a robot alone that is told to stand.
@@ -265,6 +266,7 @@ class RewardSum:
         self._scale = step_dt if config.scale_by_dt else 1.0
         self._penalty_scale = config.penalty_scale
         self._schedules = [_schedule(values["weight"]) for values in terms.values()]
+        self._whole = torch.tensor([bool(values.get("whole")) for values in terms.values()])
         self._weights = torch.empty(len(terms), device=device)
         self.set_progress(1.0)
 
@@ -272,7 +274,7 @@ class RewardSum:
         """Set the weights to those of this share of the phase, in [0, 1]."""
         weights = torch.tensor([piecewise_linear(p, progress) for p in self._schedules])
         penalty = piecewise_linear(self._penalty_scale, progress)
-        weights = torch.where(weights < 0.0, penalty * weights, weights)
+        weights = torch.where((weights < 0.0) & ~self._whole, penalty * weights, weights)
         self._weights.copy_(self._scale * weights)  # in place: a graph reads it
 
     def __call__(self, step: Step) -> torch.Tensor:
@@ -289,9 +291,12 @@ class RewardSum:
         return torch.stack(values, dim=1) * self._weights
 
 
+_OF_ALL = ("weight", "whole")  # keys that every term takes
+
+
 def _bind(name: str, values: dict) -> partial[torch.Tensor]:
     function = find_function(globals(), name, Step, where="env.rewards.terms")
-    parameters = {key: value for key, value in values.items() if key != "weight"}
+    parameters = {key: value for key, value in values.items() if key not in _OF_ALL}
     signature = inspect.signature(function)
     allowed = list(signature.parameters)[1:]
     unknown = [key for key in parameters if key not in allowed]
@@ -299,6 +304,10 @@ def _bind(name: str, values: dict) -> partial[torch.Tensor]:
         problem = f"unknown parameter '{unknown[0]}'" if unknown else "no weight"
         raise ConfigError(
             f"env.rewards.terms.{name}: {problem}; it takes {', '.join(['weight', *allowed])}"
+        )
+    if not isinstance(values.get("whole", False), bool):
+        raise ConfigError(
+            f"env.rewards.terms.{name}.whole={values['whole']!r}: must be true or false"
         )
     try:
         signature.bind(None, **parameters)

@@ -259,11 +259,11 @@ def _facts(title: str, facts: Figures) -> Table:
 
 def _save(folder: Path, report: dict[str, Figures], tables: Iterable[Table]) -> None:
     """Write all figures and tables until now: a part that fails later loses none of them."""
-    with replacing(folder / FIGURES) as path:
-        path.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
-    with replacing(folder / TABLES) as path, path.open("w", encoding="utf-8") as file:
-        file.write(f"{WRITER}\n\n")
-        _print(tables, _plain(file))
+    with replacing(folder / FIGURES) as figures, replacing(folder / TABLES) as text:
+        figures.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
+        with text.open("w", encoding="utf-8") as file:
+            file.write(f"{WRITER}\n\n")
+            _print(tables, _plain(file))
 
 
 def _plain(file: TextIO) -> Console:

@@ -202,6 +202,15 @@ def test_errors_of_posture_within_the_slack_cost_nothing():
     assert value("skill_orientation", step, sigma=0.4, slack=0.1) == pytest.approx(expected)
 
 
+def test_a_penalty_may_be_whole_from_the_start():
+    terms = {"torques": {"weight": -0.1, "whole": True}, "action_rate": {"weight": -0.1}}
+    total = RewardSum(RewardConfig(False, [[0.0, 0.5], [1.0, 1.0]], terms), 0.02, "cpu")
+    total.set_progress(0.0)
+    torch.testing.assert_close(total(crafted()), torch.tensor([[-0.5, -0.25]]))
+    with pytest.raises(ConfigError, match=r"torques\.whole=2: must be true"):
+        RewardSum(RewardConfig(False, CONSTANT, {"torques": {"weight": 1, "whole": 2}}), 1, "cpu")
+
+
 def test_weights_and_penalties_follow_their_schedules():
     terms = {"torques": {"weight": [[0.0, -0.1], [0.5, -0.3]]}, "lin_vel_y_abs": {"weight": 3.0}}
     config = RewardConfig(False, [[0.0, 0.5], [1.0, 1.0]], terms)
