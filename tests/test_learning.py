@@ -25,7 +25,7 @@ ITERATIONS = 45  # of a run planned for more: its schedules stay where skills ar
 def trained(tmp_path_factory):
     """The run, what it logged in each iteration, and its last evaluation."""
     schedule = ["iterations=260", f"evaluation.interval={ITERATIONS}"]
-    overrides = [*schedule, "device=cpu", "learner.estimator.adaboot=off"]
+    overrides = [*schedule, "device=cpu", "num_envs=1024", "learner.estimator.adaboot=off"]
     config = load_config("solo8_quick", overrides)
     run = tmp_path_factory.mktemp("run")
     evaluators = make_evaluators(config, SKILL_LEARNING, "cpu")

@@ -186,5 +186,7 @@ class Estimation:
         """Go on from a saved state."""
         self.estimator.load_state_dict(state["estimator"])
         load_adam(self.optimizer, state["optimizer"], self._device)
+        # It is set anew before every step; a run that has none left saves it as it was.
+        self._learning_rate.copy_(torch.as_tensor(state["optimizer"]["param_groups"][0]["lr"]))
         self._epoch.forget()
         self.adaboot.load_state_dict(state["adaboot"])
