@@ -47,7 +47,8 @@ class Curriculum:
         self.kind = torch.searchsorted(edges, middle.double()).clamp(max=len(library.types) - 1)
         flat = library.types.index("flat") if "flat" in library.types else -1
         self.is_flat = self.kind == flat
-        self._rough = [k for k in range(len(library.types)) if k != flat]
+        rough = [k for k in range(len(library.types)) if k != flat]
+        self._rough = torch.tensor(rough, device=device)
         self._num_skills = num_skills
         self.level = torch.zeros_like(self.kind)
         self._way = torch.zeros(n, device=device)

@@ -29,7 +29,7 @@ def library():
 
 @pytest.fixture(scope="session")
 def tiles(library):
-    """Four tiles with platforms of four heights: bars 0, plates 0.15, slopes 1.96, stairs 0.22."""
+    """Four tiles with platforms of four heights: bars 0, plates 0.15, slopes 1.96, stairs 0.11."""
     names = ["bars", "footholds", "slopes", "stairs_down"]
     levels, variants = [1, 1, 1, 0], [0, 0, 1, 1]
     return torch.tensor(
@@ -89,7 +89,7 @@ def stand(sim, ground, drill, steps=40):
 def test_every_world_has_its_own_tile(sim, ground, rough, tiles):
     show(sim, ground, rough, tiles)
     heights = ground.spawn_height.tolist()
-    assert heights == pytest.approx([0.0, 0.15, 3.4 * np.tan(np.pi / 6) - 0.005, 0.22], abs=1e-5)
+    assert heights == pytest.approx([0.0, 0.15, 3.4 * np.tan(np.pi / 6) - 0.005, 0.11], abs=1e-5)
     start, end = stand(sim, ground, rough)
     assert (end - start).abs().max() < 0.03  # m; the motors give way, the ground does not
     assert not sim.overflowed.any()
@@ -197,7 +197,9 @@ def test_balls_come_to_rest_on_the_ground(library):
         sim.step(torch.zeros(worlds, 1))
     rest = touch(ground, sim.qpos[:, :2], radius)
     sunk = rest - sim.qpos[:, 2]
-    assert sunk.abs().max() < 2e-3  # m; contacts are soft
+    still = sim.qvel[:, :3].norm(dim=1) < 0.01  # m/s; the others are on their way down an edge
+    assert still.float().mean() > 0.7
+    assert sunk[still].abs().max() < 1e-3  # m; contacts are soft
 
 
 def balls(library, worlds, radius):
