@@ -239,6 +239,21 @@ def limb_load(step: Step) -> torch.Tensor:
     return (step.robot.limb_force / step.weight).clamp(max=1.0).sum(-1)
 
 
+@remembering(air_time)
+def edge_landing(step: Step, reach: float, drop: float) -> torch.Tensor:
+    """Return the number of feet that land where the ground falls by `drop` m within `reach` m."""
+    near_edge = step.robot.ground_drop(reach) > drop
+    return (near_edge & _landing(step)).float().sum(-1)
+
+
+def stumble(step: Step, friction: float) -> torch.Tensor:
+    """Return the sum of what pushes feet sideways beyond `friction`, body weights, each at most 1.
+
+    A foot meets a riser or the side of a bar.
+    """
+    return (step.robot.side_force(friction) / step.weight).clamp(max=1.0).sum(-1)
+
+
 def _landing(step: Step) -> torch.Tensor:
     """Return the feet that stand and did not before, (N, F) bool."""
     return step.robot.foot_stands & (step.memory[air_time] > 0.0)

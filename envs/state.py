@@ -23,6 +23,7 @@ AT_LIMIT = 0.999  # of a torque's limit; the rest is rounding
 CONTACT_FORCE = 1.0  # N; a foot that presses harder than this stands
 PATCH_SPACING = 0.1  # m between the points whose mean is the ground under the base
 AHEAD = (0.0, 0.05, 0.1)  # m before a foot: the highest ground there is what a step has to clear
+AROUND = ((0.0, 0.0), (1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0))  # a foot, in its reach
 SCAN_SHAPE = (9, 7)  # points of the height scan, forward and to the left [paper: 63]
 SCAN_SPACING = 0.1  # m between them
 
@@ -49,6 +50,7 @@ class RobotState:
         self._patch = grid(3, 3, PATCH_SPACING).to(sim.device)
         self._scan = grid(*SCAN_SHAPE, SCAN_SPACING).to(sim.device)
         self._ahead = torch.tensor([[x, 0.0] for x in AHEAD], device=sim.device)
+        self._around = torch.tensor(AROUND, device=sim.device)
         self.read_kinematics()
         self._read_contacts()
 
@@ -85,6 +87,7 @@ class RobotState:
         robot.joint_torque = robot.joint_vel.clone()
         robot.peak_torque = robot.joint_torque
         robot._foot_height = torch.zeros_like(feet)
+        robot._foot_forces_w = torch.zeros_like(feet)[:, None, :, None].expand(-1, 1, -1, 3)
         robot.base_pos_w = torch.zeros_like(zero)
         robot.base_pos_w[:, 2] = robot.base_height
         robot._ground = None
@@ -131,6 +134,17 @@ class RobotState:
         around = self._ground.heights((points + ahead).flatten(1, 2)).unflatten(1, (-1, len(AHEAD)))
         return self.foot_height + around[..., 0] - around.amax(dim=-1)
 
+    def ground_drop(self, reach: float) -> torch.Tensor:
+        """Return how deep the ground falls within `reach` m around each foot, (N, F), m.
+
+        That is the height under the foot over the lowest of four points around it, at least 0.
+        """
+        if self._ground is None:
+            return torch.zeros_like(self.foot_force)
+        points = self._foot_points()[..., None, :2] + reach * self._around
+        heights = self._ground.heights(points.flatten(1, 2)).unflatten(1, (-1, len(self._around)))
+        return heights[..., 0] - heights.amin(dim=-1)
+
     @property
     def yaw(self) -> torch.Tensor:
         """Heading of the base, (N,), rad."""
@@ -170,6 +184,8 @@ class RobotState:
         # Largest force of the physics steps, so that no short contact is missed, (N, ...), N
         peaks = squared.amax(dim=1).sqrt()
         self._forces = squared
+        feet_w = record[:, :, layout.forces_w][..., : 3 * layout.geoms[0]]
+        self._foot_forces_w = feet_w.unflatten(-1, (-1, 3))  # (N, K, F, 3), N
         self.foot_force, self.base_force, self.limb_force = peaks.split(layout.geoms, dim=1)
         feet = squared[:, -1, : layout.geoms[0]]
         self.foot_contact = feet > CONTACT_FORCE**2  # (N, F) bool
@@ -186,6 +202,16 @@ class RobotState:
         forces = self._forces.sqrt().mean(dim=1)
         feet = self._layout.geoms[0]
         return forces[:, :feet].sum(dim=1), forces[:, feet:].sum(dim=1)
+
+    def side_force(self, friction: float) -> torch.Tensor:
+        """Return by how much feet are pushed harder sideways than `friction` allows, (N, F), N.
+
+        That is the largest of |F_xy| - friction |F_z| in the physics steps, at least 0: on a floor
+        of this friction a foot slips first, so a wall or an edge is in its way.
+        """
+        sideways = torch.linalg.vector_norm(self._foot_forces_w[..., :2], dim=-1)
+        excess = sideways - friction * self._foot_forces_w[..., 2].abs()
+        return excess.clamp(min=0.0).amax(dim=1)
 
     def saturation(self, limit: torch.Tensor) -> torch.Tensor:
         """Return the share of the physics steps in which a torque is at its limit, (N,).

@@ -27,6 +27,9 @@ from kiras_rl.schema import Config
 from kiras_rl.soundness import TrainingError, check_rollout, check_update
 from kiras_rl.status import Status
 
+POOLED = 3
+"""Evaluations whose mean score tells which policy is best: one alone is a matter of luck."""
+
 COUNTS = ("Episode/", "Sim/")
 """Tags of numbers that are added up, over the steps of a rollout and over the ranks."""
 
@@ -92,7 +95,8 @@ class KirasRunner(OnPolicyRunner):
         self.evaluators, self.commit = evaluators or Evaluators(), commit
         self.evaluation: dict[str, SkillResult] = {}
         self.terrain: TerrainResult | None = None
-        self.best_score = float("inf")
+        self.scores: list[float] = []  # of the last POOLED evaluations
+        self.best_score = float("inf")  # a mean of such
         self.best_networks: dict | None = None
         self.seconds, self.steps = 0.0, 0  # of training, over all phases and resumes
         self.begun_from: str | None = None  # another run's checkpoint that finetuning began with
@@ -248,8 +252,10 @@ class KirasRunner(OnPolicyRunner):
         current = score(self.evaluation)
         if self.terrain:
             current += self.terrain.score()
-        if current < self.best_score:
-            self.best_score = current
+        self.scores = [*self.scores, current][-POOLED:]
+        pooled = sum(self.scores) / len(self.scores)
+        if pooled < self.best_score:
+            self.best_score = pooled
             self.best_networks = self.alg.networks()
             self._save_as(checkpoint.BEST)
 
@@ -307,6 +313,7 @@ class KirasRunner(OnPolicyRunner):
             "robot": self.env.robot_identity(),
             "iteration": self.current_learning_iteration,
             "seconds": self.seconds,
+            "scores": self.scores,
             "best_score": self.best_score,
             "best_networks": self.best_networks,
             "learner": self.alg.save(),
@@ -353,6 +360,7 @@ class KirasRunner(OnPolicyRunner):
         self.alg.load(content["learner"], load_cfg, strict)
         self.current_learning_iteration = content["iteration"]
         self.seconds, self.best_score = content["seconds"], content["best_score"]
+        self.scores = content.get("scores", [])  # a checkpoint of an earlier version has none
         self.best_networks = content["best_networks"]
         provenance = content["description"]["provenance"]
         self.steps, self.begun_from = provenance["steps"], provenance.get("begun_from")

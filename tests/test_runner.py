@@ -194,17 +194,19 @@ def test_a_checkpoint_of_other_skills_is_refused(make_runner):
     assert "\n" not in message
 
 
-def test_the_best_evaluation_is_kept(make_runner, tell):
-    errors = iter([0.03, 0.01, 0.02])
+def test_the_policy_with_the_best_last_evaluations_is_kept(make_runner, tell):
+    errors = iter([0.03, 0.03, 0.00, 0.03, 0.01, 0.01, 0.03])
     runner = make_runner(
-        "run", "iterations=3", "evaluation.interval=1", evaluate=lambda _: tell(next(errors))
+        "run",
+        *("iterations=7", "evaluation.interval=1", "learner.ppo.num_steps=2"),
+        evaluate=lambda _: tell(next(errors)),
     )
     seen = []
     runner.learn(on_iteration=lambda status: seen.append(status.scalars["Eval/score"]))
-    assert seen == pytest.approx([1.0, 1 / 3, 2 / 3])
+    assert seen == pytest.approx([1.0, 1.0, 0.0, 1.0, 1 / 3, 1 / 3, 1.0])
     best = load_checkpoint(runner.run_dir / "checkpoints" / "best.pt")
-    assert best["iteration"] == 2
-    assert best["best_score"] == pytest.approx(1 / 3)
+    assert best["iteration"] == 5  # means of three: 2/3 at 3 and 4, 4/9 at 5, 5/9 at 6 and 7
+    assert best["best_score"] == pytest.approx(4 / 9)
 
 
 @pytest.mark.parametrize(("interval", "evaluated"), [(2, [2, 4, 5]), (10, [5]), (0, [])])

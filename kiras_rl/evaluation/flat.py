@@ -264,8 +264,8 @@ def score(results: dict[str, SkillResult]) -> float:
     """Return one number for "how good is this policy": lower is better, 0 is perfect.
 
     Errors are measured against FLOOR, which makes skills useful; a skill that does not step, steps
-    as low as the floor or a lift a second too often, or is beyond its limits in all steps costs as
-    much as an error at its limit.
+    as low as the floor or a lift a second too often, or is beyond its limits in a tenth of the steps
+    costs as much as an error at its limit.
     """
     parts = [
         r.height_error / FLOOR.height
@@ -274,8 +274,7 @@ def score(results: dict[str, SkillResult]) -> float:
         + max(0.0, 1.0 - r.lifts)
         + max(0.0, r.most_lifts - TARGET.lifts[1])
         + 2.0 * max(0.0, 1.0 - r.clearance)
-        + r.beyond
-        + r.saturated
+        + 10.0 * (r.beyond + r.saturated)
         + 2.0 * r.falls
         for r in results.values()
     ]

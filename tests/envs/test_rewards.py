@@ -49,6 +49,8 @@ def crafted(command=(0.5, 0.0, 0.2), fresh=False, fallen=False):
     robot.foot_force = row(60.0, 12.0)
     robot._foot_height = row(0.01, 0.08)
     robot.limb_force = row(0.05, 3.0)
+    first, second = [[3.0, 4.0, -2.0], [1.0, 0.0, 9.0]], [[0.0, 6.0, 5.0], [9.0, 0.0, 0.0]]
+    robot._foot_forces_w = torch.tensor([[first, second]])  # of two physics steps, two feet each
     return Step(
         robot=robot,
         task=Task.of(row(*command), torch.tensor([CRAWL]), torch.tensor([WALK])),
@@ -105,6 +107,8 @@ EXPECTED = {
     "foot_clearance": ({"height": 0.05}, 0.04 * 0.5),  # the other foot is high enough
     "feet_contact_forces": ({"threshold": 10.0, "largest": 20.0}, 20.0 + 2.0),
     "limb_load": ({}, (0.05 + 3.0) / 20.0),
+    "stumble": ({"friction": 1.0}, (3.0 + 9.0) / 20.0),
+    "edge_landing": ({"reach": 0.02, "drop": 0.02}, 0.0),  # the ground is flat
     "collision": ({"threshold": 0.1}, 1.0),
     "stand_still": ({}, 0.0),
     "stand_still_pose": ({}, 0.0),

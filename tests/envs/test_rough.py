@@ -134,6 +134,21 @@ def test_a_step_ahead_of_a_foot_has_to_be_cleared(build):
     torch.testing.assert_close(env.robot.foot_clearance, env.robot.foot_height)
 
 
+def test_the_ground_falls_beside_a_foot_on_an_edge(build):
+    env = build("finetuning.env.terrain.noise=[0,0]")
+    place(env, "stairs_down")
+    feet = env.foot_pos_b(env.robot.joint_pos)[0, :, 0]
+    front = feet > 0
+    put(env, 0.6 - 0.02 - feet.max().item())  # front feet 2 cm before the step of 12 cm
+    assert env.robot.ground_drop(0.01).abs().max() < 1e-4
+    drop = env.robot.ground_drop(0.03)
+    assert drop[:, ~front].abs().max() < 1e-4
+    torch.testing.assert_close(drop[:, front], torch.full_like(drop[:, front], 0.12))
+    place(env, "stairs_up")  # a step up is no edge to fall from
+    put(env, 0.6 - 0.02 - feet.max().item())
+    assert env.robot.ground_drop(0.03).abs().max() < 1e-4
+
+
 def test_leaving_the_tile_ends_an_episode_by_the_clock(env):
     place(env, "flat")
     qpos, qvel = env.sim.qpos.clone(), env.sim.qvel.clone()

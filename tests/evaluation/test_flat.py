@@ -168,7 +168,7 @@ def test_the_score_is_zero_when_perfect_and_one_at_a_limit():
     assert score({"a": at_limit, "b": PERFECT}) == pytest.approx(0.5)
     still = dataclasses.replace(PERFECT, lifts=0.0, velocity_error=0.12)
     assert score({"a": still}) == pytest.approx(2.0)
-    for worse in ({"clearance": 0.5}, {"most_lifts": 4.5}, {"beyond": 1.0}, {"saturated": 1.0}):
+    for worse in ({"clearance": 0.5}, {"most_lifts": 4.5}, {"beyond": 0.1}, {"saturated": 0.1}):
         assert score({"a": dataclasses.replace(PERFECT, **worse)}) == pytest.approx(1.0)
 
 
