@@ -263,9 +263,9 @@ def moving_average(signal: torch.Tensor, step_dt: float) -> torch.Tensor:
 def score(results: dict[str, SkillResult]) -> float:
     """Return one number for "how good is this policy": lower is better, 0 is perfect.
 
-    Errors are measured against FLOOR, which makes skills useful; a skill that does not step, steps
-    as low as the floor or a lift a second too often, or is beyond its limits in a tenth of the steps
-    costs as much as an error at its limit.
+    Errors are measured against FLOOR, which makes skills useful. A skill that does not step, steps
+    as low as the floor or a lift a second too often, or is beyond its limits in a tenth of its
+    steps costs as much as an error at its limit.
     """
     parts = [
         r.height_error / FLOOR.height
