@@ -2,29 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 
 import torch
 from tensordict import TensorDict
 
-from kiras_rl import distributed
 from kiras_rl import interfaces as names
 from kiras_rl.algorithms import losses
 from kiras_rl.algorithms.adaboot import MODES, AdaBoot
-from kiras_rl.algorithms.adam import load_adam, make_adam
 from kiras_rl.algorithms.storage import GroupRolloutStorage, mini_batches
+from kiras_rl.algorithms.trainer import Trainer
 from kiras_rl.config import ConfigError
 from kiras_rl.interfaces import SkillEnv
 from kiras_rl.models.estimator import VELOCITY_DIM, ContextEstimator
-from kiras_rl.recorded import Recorded
 from kiras_rl.schema import EstimatorConfig
-from kiras_rl.shards import differentiate
+from kiras_rl.shards import Batch
 
 VELOCITY_SCALE = 2.0  # in the loss: velocity errors then weigh as much as observation errors
 
 
 class Estimation:
-    """The estimator, its optimizer and AdaBoot."""
+    """The estimator, its trainer and AdaBoot."""
 
     def __init__(
         self,
@@ -45,15 +43,15 @@ class Estimation:
         self.config = config
         self.estimator = estimator.to(device)
         self._device = device
-        self._learning_rate = torch.zeros((), device=device)
-        self.optimizer = make_adam(self.estimator.parameters(), self._learning_rate, device)
         self._data: dict[str, torch.Tensor] = {}
         self._num_mini_batches = 1
-        self._epoch = Recorded(
-            self._train_epoch,
+        self.trainer = Trainer(
+            self.estimator.parameters(),
+            self._loss,
+            0.0,  # set anew before every update
             device,
+            self._batches,
             variant=lambda: self._num_mini_batches,
-            enabled=distributed.size() == 1,
         )
         self.adaboot = AdaBoot(config.adaboot, config.adaboot_floor, num_envs, device)
 
@@ -104,7 +102,7 @@ class Estimation:
                 its actions, past PPO's trust region: the actor must be able to follow.
         """
         self.adaboot.renew()
-        torch.mul(actor_rate, self.config.relative_step, out=self._learning_rate)
+        torch.mul(actor_rate, self.config.relative_step, out=self.trainer.rate)
         trained = self.adaboot.update_allowed()
         scalars = {
             "AdaBoot/trust": self.adaboot.probability.item(),
@@ -125,26 +123,15 @@ class Estimation:
             goes_on=storage.dones == 0,
         )
         self._num_mini_batches = num_mini_batches
-        totals = sum(self._epoch() for _ in range(self.config.epochs))
-        means = (totals / (num_mini_batches * self.config.epochs)).tolist()
+        means = self.trainer.train(self.config.epochs).tolist()
         tags = ("velocity", "prediction", "kl", "prior")
         return {f"Estimator/{tag}": value for tag, value in zip(tags, means, strict=True)}
 
-    def _train_epoch(self) -> torch.Tensor:
-        """Take a gradient step on every mini-batch; return the sums of `_losses`, (4,)."""
-        batches = mini_batches(self._data, self._num_mini_batches)
-        return torch.stack([self._train_step(batch) for batch in batches]).sum(0)
-
-    def _train_step(self, batch: dict[str, torch.Tensor]) -> torch.Tensor:
-        """Take one gradient step; return `_losses`, (4,)."""
-        noise = torch.randn(len(batch["skill"]), self.config.latent_dim, device=self._device)
-        goes_on = batch.pop("goes_on").squeeze(-1)  # an end has no next frame
-        extra = {"noise": noise, "target_weight": losses.weights_of(goes_on)}
-        parameters = list(self.estimator.parameters())
-        parts = differentiate(self._loss, batch | extra, parameters)
-        distributed.average_gradients(parameters)
-        self.optimizer.step()
-        return parts
+    def _batches(self) -> Iterator[Batch]:
+        for batch in mini_batches(self._data, self._num_mini_batches):
+            noise = torch.randn(len(batch["skill"]), self.config.latent_dim, device=self._device)
+            goes_on = batch.pop("goes_on").squeeze(-1)  # an end has no next frame
+            yield batch | {"noise": noise, "target_weight": losses.weights_of(goes_on)}
 
     def _loss(self, **batch: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         parts = self._losses(**batch)
@@ -178,15 +165,12 @@ class Estimation:
         """Return network, optimizer and AdaBoot."""
         return {
             "estimator": self.estimator.state_dict(),
-            "optimizer": self.optimizer.state_dict(),
+            "optimizer": self.trainer.state_dict(),
             "adaboot": self.adaboot.state_dict(),
         }
 
     def load_state_dict(self, state: dict) -> None:
         """Go on from a saved state."""
         self.estimator.load_state_dict(state["estimator"])
-        load_adam(self.optimizer, state["optimizer"], self._device)
-        # It is set anew before every step; a run that has none left saves it as it was.
-        self._learning_rate.copy_(torch.as_tensor(state["optimizer"]["param_groups"][0]["lr"]))
-        self._epoch.forget()
+        self.trainer.load_state_dict(state["optimizer"])
         self.adaboot.load_state_dict(state["adaboot"])

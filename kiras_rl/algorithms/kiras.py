@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from itertools import chain
+from collections.abc import Iterator
 
 import torch
 from rsl_rl.algorithms import PPO
@@ -15,21 +15,20 @@ from kiras_rl import distributed
 from kiras_rl import interfaces as names
 from kiras_rl.algorithms import losses, returns
 from kiras_rl.algorithms.adaboot import AdaBoot
-from kiras_rl.algorithms.adam import fit_adam, make_adam
 from kiras_rl.algorithms.estimation import Estimation
 from kiras_rl.algorithms.parts import Parts, build_parts
 from kiras_rl.algorithms.residual import Reference
 from kiras_rl.algorithms.rollout import Rollout
 from kiras_rl.algorithms.storage import GroupRolloutStorage, mini_batches
+from kiras_rl.algorithms.trainer import Trainer
 from kiras_rl.imitation.premium import PremiumSelector
 from kiras_rl.imitation.self_imitation import SelfImitation
 from kiras_rl.interfaces import SkillEnv
 from kiras_rl.models.critics import GroupCritic
 from kiras_rl.models.exported import ExportedPolicy
-from kiras_rl.recorded import Recorded
 from kiras_rl.schedules import advantage_weights, piecewise_linear
 from kiras_rl.schema import LearnerConfig
-from kiras_rl.shards import apply, differentiate
+from kiras_rl.shards import Batch, apply
 
 TASK, IMITATION = 0, 1  # reward groups
 
@@ -62,13 +61,19 @@ class KirasPPO(PPO):
             max_grad_norm=ppo.max_grad_norm,
             device=device,
         )
-        # On the device, as the KL divergence that it follows: no step of the update waits for it
-        self.learning_rate = torch.tensor(ppo.learning_rate, device=device)
         self.desired_kl = torch.zeros((), device=device)
-        parameters = chain(parts.actor.parameters(), parts.critic.parameters())
-        self.optimizer = make_adam(parameters, self.learning_rate, device)
         self._data: dict[str, torch.Tensor] = {}
-        self._epoch = Recorded(self._train_epoch, device, enabled=distributed.size() == 1)
+        self.trainer = Trainer(
+            [*parts.actor.mlp.parameters(), *parts.critic.parameters()],
+            self._loss,
+            ppo.learning_rate,
+            device,
+            self._batches,
+            adjust=self._adapt_and_clip,
+        )
+        self.optimizer = self.trainer.optimizer  # rsl-rl saves it
+        # On the device, as the KL divergence that it follows: no step of the update waits for it
+        self.learning_rate = self.trainer.rate
         self._rollout = Rollout(parts, device)
         self.config = config
         self.iterations = iterations
@@ -190,10 +195,7 @@ class KirasPPO(PPO):
         if self.reference:
             tensors |= {key: st.observations[key] for key in (names.FLAT_ACTION, names.IS_FLAT)}
         st.shuffle_into(self._data, **tensors)
-        totals = sum(self._epoch() for _ in range(self.num_learning_epochs))
-        surrogate, value, kl = (
-            totals / (self.num_mini_batches * self.num_learning_epochs)
-        ).tolist()
+        surrogate, value, kl = self.trainer.train(self.num_learning_epochs).tolist()
         return {
             "Loss/surrogate": surrogate,
             "Loss/value": value,
@@ -202,26 +204,13 @@ class KirasPPO(PPO):
             "Policy/action_std": self.actor.distribution.std_param.mean().item(),
         }
 
-    def _train_epoch(self) -> torch.Tensor:
-        """Take a gradient step on every mini-batch; return the sums of (surrogate, value, KL)."""
-        return torch.stack(
-            [self._policy_step(batch) for batch in mini_batches(self._data, self.num_mini_batches)]
-        ).sum(0)
+    def _batches(self) -> Iterator[Batch]:
+        for batch in mini_batches(self._data, self.num_mini_batches):
+            if self.reference:
+                batch["flat_weight"] = losses.weights_of(batch.pop(names.IS_FLAT).squeeze(1))
+            yield batch
 
-    def _policy_step(self, batch: dict[str, torch.Tensor]) -> torch.Tensor:
-        """Take one gradient step; return (surrogate, value, KL), (3,)."""
-        if self.reference:
-            batch["flat_weight"] = losses.weights_of(batch.pop(names.IS_FLAT).squeeze(1))
-        parameters = [*self.actor.mlp.parameters(), *self.critic.parameters()]
-        numbers = differentiate(self._policy_loss, batch, parameters)
-        numbers[2] = self._adapt_to_kl(numbers[2])
-        distributed.average_gradients(parameters)
-        for network in (self.actor, *self.critic.critics):
-            nn.utils.clip_grad_norm_(network.parameters(), self.max_grad_norm)
-        self.optimizer.step()
-        return numbers
-
-    def _policy_loss(
+    def _loss(
         self,
         actor_obs: torch.Tensor,
         critic_obs: torch.Tensor,
@@ -251,13 +240,19 @@ class KirasPPO(PPO):
             kl = distribution.kl_divergence((mean, std), distribution.params).mean()
         return loss, torch.stack([surrogate, value, kl])
 
-    def _adapt_to_kl(self, kl: torch.Tensor) -> torch.Tensor:
-        """Adapt the learning rate to this rank's mean KL divergence; return that of all ranks."""
-        kl = distributed.mean(kl)
+    def _adapt_and_clip(self, numbers: torch.Tensor) -> torch.Tensor:
+        """Adapt the step size to the mean KL divergence of all ranks, and clip the gradients.
+
+        Args:
+            numbers: What `_loss` returns on this rank, (3,).
+        """
+        kl = distributed.mean(numbers[2])
         limits = self.config.ppo.learning_rate_range
         adapted = losses.adapt_learning_rate(self.learning_rate, kl, self.desired_kl, limits)
         self.learning_rate.copy_(adapted)  # in place: the optimizer reads this tensor
-        return kl
+        for network in (self.actor, *self.critic.critics):
+            nn.utils.clip_grad_norm_(network.parameters(), self.max_grad_norm)
+        return torch.stack([*numbers[:2], kl])
 
     def _apply_schedules(self) -> None:
         """Set the action noise, the KL divergence and the imitation of the next iteration."""
@@ -349,11 +344,9 @@ class KirasPPO(PPO):
 
     def load(self, loaded_dict: dict, load_cfg: dict | None = None, strict: bool = True) -> bool:
         """Load what `save` returned."""
-        rate = self.learning_rate  # loading replaces it by a copy
         super().load(loaded_dict, load_cfg, strict)
-        self.learning_rate = rate
-        fit_adam(self.optimizer, [rate], self.device)
-        self._epoch.forget()
+        self.learning_rate = self.trainer.rate  # loading took a copy
+        self.trainer.load_state_dict(loaded_dict["optimizer_state_dict"])
         self._rollout.forget()
         self.iteration = loaded_dict["iteration"]
         self.learning_rate.fill_(loaded_dict["learning_rate"])

@@ -2,23 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 
 import torch
 from tensordict import TensorDict
 
 from kiras_rl import distributed
 from kiras_rl import interfaces as names
-from kiras_rl.algorithms.adam import load_adam, make_adam
 from kiras_rl.algorithms.losses import discriminator_loss, gradient_penalty, weights_of
 from kiras_rl.algorithms.storage import GroupRolloutStorage
+from kiras_rl.algorithms.trainer import Trainer
 from kiras_rl.imitation.premium import PremiumSelector
 from kiras_rl.interfaces import SkillEnv
 from kiras_rl.models.discriminator import Discriminator, imitation_reward
-from kiras_rl.recorded import Recorded
+from kiras_rl.recorded import Slot
 from kiras_rl.schedules import piecewise_linear
 from kiras_rl.schema import ImitationConfig
-from kiras_rl.shards import apply, differentiate
+from kiras_rl.shards import Batch, apply
 
 
 class SelfImitation:
@@ -38,7 +38,7 @@ class SelfImitation:
         num_steps: int,
         bfloat16: bool,
     ) -> None:
-        """Build discriminator, optimizer, selector and the rollout's pairs.
+        """Build discriminator, trainer, selector and the rollout's pairs.
 
         Args:
             config: See cfg/base.yaml.
@@ -55,26 +55,28 @@ class SelfImitation:
         features = keyframe_features.shape[1]
         self.config = config
         self._skills = skills
-        self._device = device
         self._noise = feature_noise.repeat(2)
         self._smooth = ~skill_code.repeat(2)
         self._noise_factor = torch.ones((), device=device)
         self._whole_from = torch.zeros((), device=device)
         dims = config.discriminator.hidden_dims
         self.discriminator = Discriminator(features, dims, bfloat16).to(device)
-        rate = config.discriminator.learning_rate
-        self.optimizer = make_adam(self.discriminator.parameters(), rate, device)
         self.selector = PremiumSelector(config.premium, keyframe_features, num_envs, num_steps)
         self._pairs = torch.zeros(num_steps, num_envs, 2 * features, device=device)
         self._valid = torch.zeros(num_steps, num_envs, dtype=torch.bool, device=device)
         self._earned = torch.zeros(num_steps, num_envs, device=device)
         self._skill = torch.zeros(num_steps * num_envs, dtype=torch.int64, device=device)
         self._rewards = torch.zeros(num_steps, num_envs, device=device)
-        self._train = Recorded(
-            self._train_step, device, carried=self._carried, enabled=distributed.size() == 1
+        self.trainer = Trainer(
+            self.discriminator.parameters(),
+            self._loss,
+            config.discriminator.learning_rate,
+            device,
+            self._batches,
+            carried=self._carried,
         )
 
-    def _carried(self) -> list[tuple[object, str]]:
+    def _carried(self) -> list[Slot]:
         """Return what a training step reads and others replace; see `Recorded`."""
         expert = [(self.selector, name) for name in ("scores", "trajectories")]
         return [*expert, (self, "_skill")]
@@ -173,9 +175,7 @@ class SelfImitation:
         scalars = self._describe(one_hot)
         self.selector.select(iteration)
         self._skill = one_hot.flatten(0, 1).argmax(dim=-1)
-        for _ in range(self.config.discriminator.updates):
-            numbers = self._train()
-        loss, expert, policy = numbers.tolist()
+        loss, expert, policy = self.trainer.train(self.config.discriminator.updates).tolist()
         scalars |= {
             "Discriminator/loss": loss,
             "Discriminator/expert": expert,
@@ -183,8 +183,8 @@ class SelfImitation:
         }
         return scalars | self._describe_buffer(iteration)
 
-    def _train_step(self) -> torch.Tensor:
-        """Take one step on a batch; return loss and mean scores of experts and policy, (3,).
+    def _batches(self) -> Iterator[Batch]:
+        """Draw the one batch of an update.
 
         Experts show the same skills as the policy's pairs: other proportions would reward a skill
         for being frequent, as its code is an input.
@@ -195,13 +195,12 @@ class SelfImitation:
         expert = self._with_noise(self.selector.sample(self._skill[drawn]))
         policy = self._with_noise(pairs[drawn])
         blend = torch.rand(size, 1, device=pairs.device)
-        batch = {"expert": expert, "policy": policy, "weight": weights_of(valid[drawn])}
-        batch["between"] = blend * expert + (1.0 - blend) * policy
-        parameters = list(self.discriminator.parameters())
-        numbers = differentiate(self._loss, batch, parameters)
-        distributed.average_gradients(parameters)
-        self.optimizer.step()
-        return numbers
+        yield {
+            "expert": expert,
+            "policy": policy,
+            "weight": weights_of(valid[drawn]),
+            "between": blend * expert + (1.0 - blend) * policy,
+        }
 
     def _with_noise(self, pairs: torch.Tensor) -> torch.Tensor:
         return pairs + self._noise_factor * self._noise * torch.randn_like(pairs)
@@ -251,15 +250,14 @@ class SelfImitation:
         """Return networks, optimizer and buffers."""
         return {
             "discriminator": self.discriminator.state_dict(),
-            "optimizer": self.optimizer.state_dict(),
+            "optimizer": self.trainer.state_dict(),
             "selector": self.selector.state_dict(),
         }
 
     def load_state_dict(self, state: dict) -> None:
         """Go on from a saved state."""
         self.discriminator.load_state_dict(state["discriminator"])
-        load_adam(self.optimizer, state["optimizer"], self._device)
-        self._train.forget()
+        self.trainer.load_state_dict(state["optimizer"])
         self.selector.load_state_dict(state["selector"])
 
 

@@ -61,7 +61,7 @@ def test_the_estimator_takes_steps_in_proportion_to_those_of_the_actor(make_runn
     )
     runner.learn(1)
     assert runner.alg.learning_rate == pytest.approx(rate)
-    [group] = runner.alg.estimation.optimizer.param_groups
+    [group] = runner.alg.estimation.trainer.optimizer.param_groups
     assert group["lr"] == pytest.approx(0.3 * rate)
 
 
@@ -230,8 +230,8 @@ def test_a_saved_learner_goes_on(make_runner):
 def test_replayed_rollouts_and_updates_are_the_same(make_runner, taped, phase):
     plain, replayed = (make_runner("learner.estimator.epochs=3", phase=phase) for _ in range(2))
     recorded = [replayed.alg._rollout._act, replayed.alg._rollout._store]
-    recorded += [replayed.alg._epoch, replayed.alg.estimation._epoch]
-    recorded += [replayed.alg.imitation._train] if replayed.alg.imitation else []
+    parts = [replayed.alg, replayed.alg.estimation, replayed.alg.imitation]
+    recorded += [part.trainer._pass for part in parts if part]
     for part in recorded:
         part.records = True
     for runner in (plain, replayed):
