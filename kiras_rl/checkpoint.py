@@ -14,7 +14,7 @@ from kiras_rl import __version__, distributed
 from kiras_rl.files import CheckedFile, replacing
 from kiras_rl.models.exported import ExportedPolicy, build_policy
 
-FORMAT = 3
+FORMAT = 4
 FOLDER = "checkpoints"
 LATEST, BEST = "latest.pt", "best.pt"
 FLAT = "flat.pt"  # the best of skill learning, once finetuning has begun

@@ -65,7 +65,7 @@ def rsl_rl_config(config: Config, phase: str, step_dt: float) -> dict:
     alone = phase_config(config, phase)
     finetuning = config.finetuning if phase == FINETUNING else None
     return {
-        "algorithm": {"class_name": "kiras_rl.algorithms.kiras.KirasPPO"},
+        "algorithm": {"class_name": alone.learner.class_name},
         "learner": alone.learner,
         "iterations": alone.iterations,
         "retention": finetuning.retention if finetuning else None,

@@ -223,12 +223,11 @@ class KirasRunner(OnPolicyRunner):
         return means
 
     def _renew_skill_probabilities(self, scalars: dict[str, float]) -> None:
-        probabilities = self.alg.skill_probabilities(self.env.keyframe_observations())
-        if probabilities is None:
-            return
-        self.env.set_skill_probabilities(probabilities)
-        for name, value in zip(self.env.skills, probabilities.tolist(), strict=True):
-            scalars[f"Skill/probability_{name}"] = value
+        self.alg.choose_skills(self.env.keyframe_observations())
+        self._tell_skill_probabilities()
+        if (probabilities := self.alg.skill_probabilities) is not None:
+            for name, value in zip(self.env.skills, probabilities.tolist(), strict=True):
+                scalars[f"Skill/probability_{name}"] = value
 
     def _evaluate_when_due(self) -> dict[str, float]:
         interval, done = self.config.evaluation.interval, self.current_learning_iteration
@@ -390,8 +389,8 @@ class KirasRunner(OnPolicyRunner):
         self._tell_skill_probabilities()
 
     def _tell_skill_probabilities(self) -> None:
-        if self.alg.sampler:
-            self.env.set_skill_probabilities(self.alg.sampler.probabilities)
+        if (probabilities := self.alg.skill_probabilities) is not None:
+            self.env.set_skill_probabilities(probabilities)
 
     def _read(self, path: str | Path) -> tuple[dict, dict]:
         content, own = checkpoint.load_ranks(Path(path))

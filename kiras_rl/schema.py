@@ -241,14 +241,16 @@ class PPOConfig:
 
 @dataclass
 class LearnerConfig:
-    """The learner; a null block removes that part of KiRAS."""
+    """The learner; a null block removes that part of KiRAS, `parts` adds others."""
 
+    class_name: str
     precision: str
     ppo: PPOConfig
     imitation: ImitationConfig | None
     multi_critic: MultiCriticConfig | None
     estimator: EstimatorConfig | None
     skill_init: SkillInitConfig | None
+    parts: dict[str, Any]
 
 
 @dataclass

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import torch
 
+from kiras_rl.algorithms.part import Part, Setting
 from kiras_rl.config import ConfigError
 from kiras_rl.schema import SkillInitConfig
 
@@ -44,7 +45,7 @@ def cover_all_skills(probabilities: torch.Tensor, practised: torch.Tensor) -> to
     return covered / covered.sum()
 
 
-class SkillSampler:
+class SkillSampler(Part):
     """The probabilities with which the environment draws skills, renewed once an iteration."""
 
     def __init__(self, config: SkillInitConfig, num_skills: int, device: str) -> None:
@@ -61,11 +62,32 @@ class SkillSampler:
         self._config = config
         self.probabilities = torch.full((num_skills,), 1.0 / num_skills, device=device)
 
-    def update(self, values: torch.Tensor, practised: torch.Tensor) -> None:
+    @classmethod
+    def build(cls, config: SkillInitConfig, setting: Setting) -> SkillSampler:
+        """Build for the skills of an environment.
+
+        Raises:
+            ConfigError: A floor that all skills together cannot have.
+        """
+        return cls(config, len(setting.env.skills), setting.device)
+
+    def choose_skills(self, values: torch.Tensor, practised: torch.Tensor) -> None:
         """Renew the probabilities from task values (S,) and practised steps (S,)."""
-        if len(values) < 2:
-            return  # one skill: nothing to choose
-        new = skill_probabilities(values, self._config.floor)
-        keep = self._config.smoothing
-        mixed = keep * self.probabilities + (1.0 - keep) * new
-        self.probabilities = cover_all_skills(mixed, practised)
+        if len(values) > 1:  # with one skill there is nothing to choose
+            new = skill_probabilities(values, self._config.floor)
+            keep = self._config.smoothing
+            mixed = keep * self.probabilities + (1.0 - keep) * new
+            self.probabilities = cover_all_skills(mixed, practised)
+
+    def begin_from(self, networks: dict[str, dict], state: dict) -> None:
+        """Go on with the probabilities of the phase before."""
+        if state:
+            self.load_state_dict(state)
+
+    def state_dict(self) -> dict:
+        """Return the probabilities."""
+        return {"probabilities": self.probabilities}
+
+    def load_state_dict(self, state: dict) -> None:
+        """Take saved probabilities."""
+        self.probabilities = state["probabilities"].to(self.probabilities.device)

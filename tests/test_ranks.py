@@ -100,23 +100,25 @@ def test_networks_buffer_and_probabilities_are_the_same_on_both_ranks(ranks):
     one, other = (rank["whole"]["learner"] for rank in ranks)
     for name in ("actor_state_dict", "critic_state_dict", "optimizer_state_dict", "learning_rate"):
         assert same(one[name], other[name]), name
-    for part in ("estimation", "imitation"):
+    one, other = one["parts"], other["parts"]
+    for part in ("estimator", "imitation"):
         for name in set(one[part]) - {"adaboot", "selector"}:
             assert same(one[part][name], other[part][name]), name
     for name in ("scores", "born", "trajectories"):
         first, second = (x["imitation"]["selector"][name] for x in (one, other))
         assert same(first, second), name
-    assert same(one["skill_probabilities"], other["skill_probabilities"])
-    assert len(one["skill_probabilities"].unique()) > 1
+    drawn, also = (x["skill_init"]["probabilities"] for x in (one, other))
+    assert same(drawn, also)
+    assert len(drawn.unique()) > 1
     for name in ("probability", "ready"):
-        assert same(one["estimation"]["adaboot"][name], other["estimation"]["adaboot"][name])
-    assert one["estimation"]["adaboot"]["ready"]
+        assert same(one["estimator"]["adaboot"][name], other["estimator"]["adaboot"][name])
+    assert one["estimator"]["adaboot"]["ready"]
 
 
 def test_the_buffer_holds_windows_of_both_ranks(ranks):
     """What a rank recorded last is still in its recorder."""
     for rank in ranks:
-        selector = rank["whole"]["learner"]["imitation"]["selector"]
+        selector = rank["whole"]["learner"]["parts"]["imitation"]["selector"]
         kept = selector["trajectories"][selector["scores"].isfinite()][:, -1]  # last frames
         recorded = selector["_frames"].flatten(0, 1)
         assert (kept[:, None] == recorded).all(dim=-1).any()
@@ -191,19 +193,20 @@ def test_on_one_process_all_but_the_worlds_goes_on(run, caplog):
     mine = runner.alg.save()
     for name in ("actor_state_dict", "optimizer_state_dict", "learning_rate"):
         assert same(mine[name], saved["learner"][name])
-    adaboot, before = (x["estimation"]["adaboot"] for x in (mine, saved["learner"]))
+    adaboot, before = (x["parts"]["estimator"]["adaboot"] for x in (mine, saved["learner"]))
     assert same(adaboot["probability"], before["probability"])
     assert adaboot["_last"].isnan().all() and (adaboot["_length"] == 0).all()
     assert not same(runner.env.state_dict()["sim"], saved["env"]["sim"])
-    assert same(runner.env.state_dict()["probabilities"], saved["learner"]["skill_probabilities"])
+    drawn = saved["learner"]["parts"]["skill_init"]["probabilities"]
+    assert same(runner.env.state_dict()["probabilities"], drawn)
 
 
 def test_the_premium_buffer_goes_on_too_but_not_what_is_being_recorded(folder, caplog, tmp_path):
     content = load_checkpoint(folder / "rank_0" / "whole" / "checkpoints" / "latest.pt")
     latest = tmp_path / "checkpoints" / "latest.pt"
     save_checkpoint(latest, content)
-    selector = resume(latest, []).alg.imitation.selector.state_dict()
-    before = content["learner"]["imitation"]["selector"]
+    selector = resume(latest, []).alg.parts["imitation"].selector.state_dict()
+    before = content["learner"]["parts"]["imitation"]["selector"]
     assert same(selector["trajectories"], before["trajectories"])
     assert same(selector["scores"], before["scores"])
     assert (selector["_age"] == 0).all() and (before["_age"] > 0).any()

@@ -235,7 +235,7 @@ def test_an_update_that_leaves_no_numbers_ends_the_run(make_runner):
     runner = make_runner("broken")
     runner.learn(1)
     before = latest(runner).read_bytes()
-    weight = next(runner.alg.estimation.estimator.parameters())
+    weight = next(runner.alg.parts["estimator"].estimator.parameters())
     weight.data.view(-1)[0] = math.nan
     with pytest.raises(TrainingError, match=r"iteration 2: .*not finite"):
         runner.learn()

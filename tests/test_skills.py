@@ -57,12 +57,12 @@ def test_a_skill_that_nobody_practised_gets_the_chance_of_the_most_practised():
 def test_the_sampler_follows_slowly():
     sampler = SkillSampler(SkillInitConfig(floor=0.0, smoothing=0.9), 3, "cpu")
     torch.testing.assert_close(sampler.probabilities, torch.full((3,), 1 / 3))
-    sampler.update(torch.tensor([1.0, 2.0, 3.0]), practised=torch.ones(3))
+    sampler.choose_skills(torch.tensor([1.0, 2.0, 3.0]), practised=torch.ones(3))
     new = torch.tensor([5 / 12, 4 / 12, 3 / 12])
     torch.testing.assert_close(sampler.probabilities, 0.9 / 3 + 0.1 * new)
 
 
 def test_one_skill_is_always_drawn():
     sampler = SkillSampler(SkillInitConfig(floor=0.05, smoothing=0.9), 1, "cpu")
-    sampler.update(torch.tensor([2.0]), practised=torch.ones(1))
+    sampler.choose_skills(torch.tensor([2.0]), practised=torch.ones(1))
     assert sampler.probabilities.tolist() == [1.0]

@@ -90,11 +90,11 @@ class PartTimer:
     def wrap_all(self, root: Any, parts: Iterable[tuple[str, str, str]]) -> None:
         """Time (owner, method, part) each; an owner is named from `root`, as `alg.imitation`.
 
-        An owner that is None has nothing to time.
+        An owner that does not exist has nothing to time.
         """
         for path, method, part in parts:
             names = path.split(".") if path else []
-            owner = reduce(lambda found, name: getattr(found, name, None), names, root)
+            owner = reduce(child, names, root)
             if owner is not None:
                 self.wrap(owner, method, part)
 
@@ -107,3 +107,8 @@ class PartTimer:
         for owner, method in reversed(self._wrapped):
             delattr(owner, method)
         self._wrapped.clear()
+
+
+def child(owner: Any, name: str) -> Any:
+    """Return what a dictionary or an object calls by this name, None where there is none."""
+    return owner.get(name) if isinstance(owner, dict) else getattr(owner, name, None)

@@ -6,14 +6,15 @@ from collections.abc import Iterator, Mapping
 
 import torch
 from tensordict import TensorDict
+from torch import nn
 
 from kiras_rl import interfaces as names
 from kiras_rl.algorithms import losses
 from kiras_rl.algorithms.adaboot import MODES, AdaBoot
+from kiras_rl.algorithms.part import Iteration, Outcome, Part, Setting
 from kiras_rl.algorithms.storage import GroupRolloutStorage, mini_batches
 from kiras_rl.algorithms.trainer import Trainer
 from kiras_rl.config import ConfigError
-from kiras_rl.interfaces import SkillEnv
 from kiras_rl.models.estimator import VELOCITY_DIM, ContextEstimator
 from kiras_rl.schema import EstimatorConfig
 from kiras_rl.shards import Batch
@@ -21,7 +22,7 @@ from kiras_rl.shards import Batch
 VELOCITY_SCALE = 2.0  # in the loss: velocity errors then weigh as much as observation errors
 
 
-class Estimation:
+class Estimation(Part):
     """The estimator, its trainer and AdaBoot."""
 
     def __init__(
@@ -56,22 +57,34 @@ class Estimation:
         self.adaboot = AdaBoot(config.adaboot, config.adaboot_floor, num_envs, device)
 
     @classmethod
-    def build(
-        cls, config: EstimatorConfig | None, obs: TensorDict, env: SkillEnv, device: str
-    ) -> Estimation | None:
-        """Build for an environment, or return None where the configuration has no estimator."""
-        if config is None:
-            return None
+    def build(cls, config: EstimatorConfig, setting: Setting) -> Estimation:
+        """Build for the observations of an environment.
+
+        Raises:
+            ConfigError: Unknown AdaBoot mode.
+        """
+        obs = setting.obs
         proprio = obs[names.PROPRIO].shape[1]
         estimator = ContextEstimator(
             proprio_dim=proprio,
             history_length=obs[names.HISTORY].shape[1] // proprio,
-            num_skills=len(env.skills),
+            num_skills=len(setting.env.skills),
             latent_dim=config.latent_dim,
             encoder_dims=list(config.encoder_dims),
             decoder_dims=list(config.decoder_dims),
         )
-        return cls(config, estimator, len(obs), device)
+        return cls(config, estimator, len(obs), setting.device)
+
+    def groups(self, obs: TensorDict) -> dict[str, torch.Tensor]:
+        """Return the context, and the frame that is to be predicted."""
+        return {
+            names.CONTEXT: self.context(obs),
+            names.NEXT_PROPRIO: torch.zeros_like(obs[names.PROPRIO]),
+        }
+
+    def observe(self, obs: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+        """Return the context: an observation of the step as all others are."""
+        return {names.CONTEXT: self.context(obs)}
 
     @torch.no_grad()
     def context(self, obs: Mapping[str, torch.Tensor]) -> torch.Tensor:
@@ -86,41 +99,37 @@ class Estimation:
             context = torch.cat([velocity, context[:, VELOCITY_DIM:]], dim=-1)
         return context
 
-    def record(self, rewards: torch.Tensor, dones: torch.Tensor) -> None:
-        """Let AdaBoot see a step's rewards and dones, (N,)."""
-        self.adaboot.record(rewards, dones)
+    def record(self, rollout: GroupRolloutStorage, step: Outcome) -> dict[str, torch.Tensor]:
+        """Let AdaBoot see rewards and dones; store the frame after the step."""
+        self.adaboot.record(step.rewards, step.dones)
+        return {names.NEXT_PROPRIO: step.extras[names.NEXT_PROPRIO]}
 
-    def update(
-        self, storage: GroupRolloutStorage, num_mini_batches: int, actor_rate: torch.Tensor
-    ) -> dict[str, float]:
+    def update(self, rollout: GroupRolloutStorage, iteration: Iteration) -> dict[str, float]:
         """Train on the rollout unless AdaBoot withholds it; return scalars for the log.
 
-        Args:
-            storage: The rollout.
-            num_mini_batches: Gradient steps of a pass over it.
-            actor_rate: Step size of the actor. A step here changes what the actor is told, and so
-                its actions, past PPO's trust region: the actor must be able to follow.
+        A step changes what the actor is told, and so its actions, past PPO's trust region. Its size
+        follows that of the actor's, which must be able to follow.
         """
         self.adaboot.renew()
-        torch.mul(actor_rate, self.config.relative_step, out=self.trainer.rate)
+        torch.mul(iteration.actor_rate, self.config.relative_step, out=self.trainer.rate)
         trained = self.adaboot.update_allowed()
         scalars = {
             "AdaBoot/trust": self.adaboot.probability.item(),
             "AdaBoot/trained": float(trained),
         }
         if trained:
-            scalars |= self._train(storage, num_mini_batches)
+            scalars |= self._train(rollout, iteration.mini_batches)
         return scalars
 
-    def _train(self, storage: GroupRolloutStorage, num_mini_batches: int) -> dict[str, float]:
-        obs = storage.observations
-        storage.shuffle_into(
+    def _train(self, rollout: GroupRolloutStorage, num_mini_batches: int) -> dict[str, float]:
+        obs = rollout.observations
+        rollout.shuffle_into(
             self._data,
             history=obs[names.HISTORY],
             velocity=obs[names.VELOCITY],
             target=obs[names.NEXT_PROPRIO],
             skill=obs[names.SKILL],
-            goes_on=storage.dones == 0,
+            goes_on=rollout.dones == 0,
         )
         self._num_mini_batches = num_mini_batches
         means = self.trainer.train(self.config.epochs).tolist()
@@ -161,6 +170,18 @@ class Estimation:
             losses.gaussian_kl(prior_mean, prior_log_var, zero, zero).mean(),
         )
 
+    def networks(self) -> dict[str, nn.Module]:
+        """Return the estimator."""
+        return {"estimator": self.estimator}
+
+    def lasting(self) -> dict[str, nn.Module]:
+        """Return the estimator."""
+        return self.networks()
+
+    def onboard(self) -> nn.Module:
+        """Return the estimator."""
+        return self.estimator
+
     def state_dict(self) -> dict:
         """Return network, optimizer and AdaBoot."""
         return {
@@ -174,3 +195,11 @@ class Estimation:
         self.estimator.load_state_dict(state["estimator"])
         self.trainer.load_state_dict(state["optimizer"])
         self.adaboot.load_state_dict(state["adaboot"])
+
+    def world_state(self) -> dict:
+        """Return AdaBoot's episodes."""
+        return self.adaboot.world_state()
+
+    def load_world_state(self, state: dict) -> None:
+        """Take AdaBoot's episodes."""
+        self.adaboot.load_state_dict(state)

@@ -1,9 +1,10 @@
-"""KirasPPO: PPO with two critics, self-imitation, a context estimator and skill selection."""
+"""KirasPPO: PPO with a critic for each reward group, and parts that shape what it learns."""
 
 from __future__ import annotations
 
 import copy
 from collections.abc import Iterator
+from itertools import chain
 
 import torch
 from rsl_rl.algorithms import PPO
@@ -14,15 +15,11 @@ from torch import nn
 from kiras_rl import distributed
 from kiras_rl import interfaces as names
 from kiras_rl.algorithms import losses, returns
-from kiras_rl.algorithms.adaboot import AdaBoot
-from kiras_rl.algorithms.estimation import Estimation
-from kiras_rl.algorithms.parts import Parts, build_parts
-from kiras_rl.algorithms.residual import Reference
+from kiras_rl.algorithms.part import Iteration
+from kiras_rl.algorithms.parts import Learner, build_learner, reward_groups
 from kiras_rl.algorithms.rollout import Rollout
 from kiras_rl.algorithms.storage import GroupRolloutStorage, mini_batches
 from kiras_rl.algorithms.trainer import Trainer
-from kiras_rl.imitation.premium import PremiumSelector
-from kiras_rl.imitation.self_imitation import SelfImitation
 from kiras_rl.interfaces import SkillEnv
 from kiras_rl.models.critics import GroupCritic
 from kiras_rl.models.exported import ExportedPolicy
@@ -30,26 +27,31 @@ from kiras_rl.schedules import advantage_weights, piecewise_linear
 from kiras_rl.schema import LearnerConfig
 from kiras_rl.shards import Batch, apply
 
-TASK, IMITATION = 0, 1  # reward groups
+TASK = 0  # reward group; those of the parts follow
 
 
 class KirasPPO(PPO):
-    """The learner. Parts that the configuration sets to null do not exist.
+    """The learner: actor, critics, and the parts that the configuration lists.
 
     Letters: T steps, N worlds, G reward groups (task, imitation), S skills.
+
+    Attributes:
+        parts: By name, in the order in which they are asked; see kiras_rl.algorithms.part.
     """
 
     actor: MLPModel
     critic: GroupCritic
     storage: GroupRolloutStorage
 
-    def __init__(self, parts: Parts, config: LearnerConfig, iterations: int, device: str) -> None:
-        """Take the parts; `iterations` is the length of the phase."""
+    def __init__(
+        self, learner: Learner, config: LearnerConfig, iterations: int, device: str
+    ) -> None:
+        """Take what was built; `iterations` is the length of the phase."""
         ppo = config.ppo
         super().__init__(
-            parts.actor,
-            parts.critic,
-            parts.storage,
+            learner.actor,
+            learner.critic,
+            learner.storage,
             num_learning_epochs=ppo.num_epochs,
             num_mini_batches=ppo.num_mini_batches,
             clip_param=ppo.clip_param,
@@ -64,7 +66,7 @@ class KirasPPO(PPO):
         self.desired_kl = torch.zeros((), device=device)
         self._data: dict[str, torch.Tensor] = {}
         self.trainer = Trainer(
-            [*parts.actor.mlp.parameters(), *parts.critic.parameters()],
+            [*learner.actor.mlp.parameters(), *learner.critic.parameters()],
             self._loss,
             ppo.learning_rate,
             device,
@@ -74,12 +76,12 @@ class KirasPPO(PPO):
         self.optimizer = self.trainer.optimizer  # rsl-rl saves it
         # On the device, as the KL divergence that it follows: no step of the update waits for it
         self.learning_rate = self.trainer.rate
-        self._rollout = Rollout(parts, device)
+        self._rollout = Rollout(learner, device)
         self.config = config
         self.iterations = iterations
         self.iteration = 0
-        self.imitation, self.estimation = parts.imitation, parts.estimation
-        self.sampler, self.reference = parts.sampler, parts.reference
+        self.parts, self._policy = learner.parts, learner.policy
+        self._earning = reward_groups(self.parts)
         self._apply_schedules()
 
     @property
@@ -102,9 +104,8 @@ class KirasPPO(PPO):
             return self.policy()(obs[names.PROPRIO], obs[names.HISTORY])[0]
 
     def policy(self) -> ExportedPolicy:
-        """Return estimator and actor as the module that is exported."""
-        estimator = self.estimation.estimator if self.estimation else None
-        return ExportedPolicy(estimator, self.actor.mlp)
+        """Return actor and estimator as the module that is exported."""
+        return self._policy
 
     def process_env_step(
         self, obs: TensorDict, rewards: torch.Tensor, dones: torch.Tensor, extras: dict
@@ -143,21 +144,19 @@ class KirasPPO(PPO):
         return values.unflatten(0, observations.shape[:-1])
 
     def _group_rewards(self) -> torch.Tensor:
-        """Return task and imitation rewards, (T, N, G); summed where there is one critic."""
+        """Return the rewards of task and parts, (T, N, G); summed where there is one critic."""
         task = self.storage.task_rewards
         task = task.clamp(min=0.0) if self.config.ppo.only_positive_rewards else task
-        if self.imitation is None:
-            return task
-        imitation = self.imitation.rewards().unsqueeze(-1)
-        if self.config.multi_critic is None:
-            return task + imitation
-        return torch.cat([task, imitation], dim=-1)
+        groups = [task, *(part.rewards().unsqueeze(-1) for part in self._earning)]
+        return torch.cat(groups, dim=-1) if self.config.multi_critic else sum(groups)
 
     def _weights(self) -> tuple[float, ...]:
+        """Return omega_1 of the task's advantages, and omega_2 of those of each part."""
         mix = self.config.multi_critic
-        if mix is None or self.imitation is None:
+        if mix is None or not self._earning:
             return (1.0,)
-        return advantage_weights(self.progress, mix.sigma, mix.omega2_floor)
+        task, other = advantage_weights(self.progress, mix.sigma, mix.omega2_floor)
+        return (task, *(other for _ in self._earning))
 
     def _std_floor(self) -> float:
         mix = self.config.multi_critic
@@ -169,12 +168,9 @@ class KirasPPO(PPO):
         """Train every part on the rollout; return scalars for the log, by their full names."""
         scalars = self._describe_rollout()
         scalars |= self._update_policy()
-        if self.estimation:
-            scalars |= self.estimation.update(
-                self.storage, self.num_mini_batches, self.learning_rate
-            )
-        if self.imitation:
-            scalars |= self.imitation.update(self.storage, self.iteration)
+        now = Iteration(self.iteration, self.num_mini_batches, self.learning_rate)
+        for part in self.parts.values():
+            scalars |= part.update(self.storage, now)
         self.storage.clear()
         self.iteration += 1
         self._apply_schedules()
@@ -192,8 +188,8 @@ class KirasPPO(PPO):
             "mean": st.action_mean,
             "std": st.action_std,
         }
-        if self.reference:
-            tensors |= {key: st.observations[key] for key in (names.FLAT_ACTION, names.IS_FLAT)}
+        for part in self.parts.values():
+            tensors |= {key: st.observations[key] for key in part.learns_from}
         st.shuffle_into(self._data, **tensors)
         surrogate, value, kl = self.trainer.train(self.num_learning_epochs).tolist()
         return {
@@ -206,8 +202,8 @@ class KirasPPO(PPO):
 
     def _batches(self) -> Iterator[Batch]:
         for batch in mini_batches(self._data, self.num_mini_batches):
-            if self.reference:
-                batch["flat_weight"] = losses.weights_of(batch.pop(names.IS_FLAT).squeeze(1))
+            for part in self.parts.values():
+                batch |= part.prepare(batch)
             yield batch
 
     def _loss(
@@ -220,8 +216,7 @@ class KirasPPO(PPO):
         returns: torch.Tensor,
         mean: torch.Tensor,
         std: torch.Tensor,
-        flat_action: torch.Tensor | None = None,
-        flat_weight: torch.Tensor | None = None,
+        **of_parts: torch.Tensor,
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """Return the loss on rows of the rollout and (surrogate, value, KL), (3,)."""
         distribution = copy.copy(self.actor.distribution)  # it remembers what it was updated with
@@ -232,10 +227,8 @@ class KirasPPO(PPO):
         )  # fmt: skip
         value = losses.value_loss(self.critic({names.CRITIC: critic_obs}), returns)
         loss = surrogate + self.value_loss_coef * value
-        if self.reference and flat_action is not None and flat_weight is not None:
-            loss = loss + self.reference.loss_weight * losses.retention_loss(
-                distribution.mean, flat_action, flat_weight
-            )
+        for part in self.parts.values():
+            loss = loss + part.policy_loss(distribution.mean, of_parts)
         with torch.no_grad():
             kl = distribution.kl_divergence((mean, std), distribution.params).mean()
         return loss, torch.stack([surrogate, value, kl])
@@ -260,69 +253,73 @@ class KirasPPO(PPO):
             piecewise_linear(self.config.ppo.action_std, self.progress)
         )
         self.desired_kl.fill_(piecewise_linear(self.config.ppo.desired_kl, self.progress))
-        if self.imitation:
-            self.imitation.set_progress(self.progress)
+        for part in self.parts.values():
+            part.set_progress(self.progress)
 
     # --- skills ---------------------------------------------------------------------------------
 
-    def skill_probabilities(self, keyframe_observations: torch.Tensor) -> torch.Tensor | None:
-        """Renew the skill probabilities from the task critic; None where skills are uniform.
+    def choose_skills(self, keyframe_observations: torch.Tensor) -> None:
+        """Let the parts choose what is practised next, by the values of the task critic.
 
         Args:
             keyframe_observations: Critic observations at the keyframes, (S, commands, C).
         """
-        if self.sampler is None:
-            return None
         with torch.no_grad():
             values = self.critic({names.CRITIC: keyframe_observations.flatten(0, 1)})[:, TASK]
         values = values.unflatten(0, keyframe_observations.shape[:2]).mean(dim=1)
-        self.sampler.update(distributed.mean(values), distributed.total(self._practised))
-        return self.sampler.probabilities
+        values, practised = distributed.mean(values), distributed.total(self._practised)
+        for part in self.parts.values():
+            part.choose_skills(values, practised)
+
+    @property
+    def skill_probabilities(self) -> torch.Tensor | None:
+        """How likely the environment shall draw each skill, (S,); None where no part says so."""
+        wanted = (part.probabilities for part in self.parts.values())
+        return next((chosen for chosen in wanted if chosen is not None), None)
 
     def _describe_rollout(self) -> dict[str, float]:
         st = self.storage
         one_hot = st.observations[names.SKILL].flatten(0, 1)  # (T N, S)
         self._practised = one_hot.sum(dim=0)
         scalars = {"Policy/advantage_weight_task": self._weights()[TASK]}
-        for g, group in enumerate(("task", "imitation")[: st.rewards.shape[-1]]):
+        groups = ["task", *(part.reward_group for part in self._earning)]
+        for g, group in enumerate(groups[: st.rewards.shape[-1]]):
             kinds = {"reward": st.rewards, "return": st.returns, "value": st.values}
             scalars |= {f"Critic/{group}_{k}": x[..., g].mean().item() for k, x in kinds.items()}
             spread = (st.returns - st.values)[..., g].std()
             scalars[f"Critic/{group}_advantage_std"] = spread.item()
-        return scalars | (self.reference.describe(st) if self.reference else {})
+        for part in self.parts.values():
+            scalars |= part.describe(st)
+        return scalars
 
     # --- construction, modes, state -------------------------------------------------------------
 
     @staticmethod
     def construct_algorithm(obs: TensorDict, env: SkillEnv, cfg: dict, device: str) -> KirasPPO:
-        """Build the learner of a phase; see `build_parts` for the arguments."""
-        parts = build_parts(obs, env, cfg, device)
-        return KirasPPO(parts, config=cfg["learner"], iterations=cfg["iterations"], device=device)
+        """Build the learner of a phase; see `build_learner` for the arguments."""
+        learner = build_learner(obs, env, cfg, device)
+        return KirasPPO(learner, cfg["learner"], cfg["iterations"], device)
 
     def networks(self) -> dict:
         """Return copies of all weights that go on into the next phase."""
-        parts = {"actor": self.actor, "critic": self.critic.critics[TASK]}
-        if self.estimation:
-            parts["estimator"] = self.estimation.estimator
-        return {name: copy.deepcopy(part.state_dict()) for name, part in parts.items()}
+        lasting: dict[str, nn.Module] = {"actor": self.actor, "critic": self.critic.critics[TASK]}
+        for part in self.parts.values():
+            lasting |= part.lasting()
+        return {name: copy.deepcopy(network.state_dict()) for name, network in lasting.items()}
 
     def begin_from(self, networks: dict, learner: dict) -> None:
         """Begin a phase where the one before ended.
 
         Args:
-            networks: What `networks` returned there; frozen, they are also the reference.
-            learner: What `save` returned there: step size and skill probabilities go on.
+            networks: What `networks` returned there.
+            learner: What `save` returned there: step size and what parts keep go on.
         """
         self.actor.load_state_dict(networks["actor"])
         self.critic.critics[TASK].load_state_dict(networks["critic"])
-        if self.estimation:
-            self.estimation.estimator.load_state_dict(networks["estimator"])
-        if self.reference:
-            self.reference.policy.load_state_dict(self.policy().state_dict())
         limits = self.config.ppo.learning_rate_range
         self.learning_rate.fill_(learner["learning_rate"]).clamp_(*limits)
-        if self.sampler and "skill_probabilities" in learner:
-            self.sampler.probabilities = learner["skill_probabilities"].to(self.device)
+        for name, part in self.parts.items():
+            part.begin_from(networks, learner["parts"].get(name, {}))
         self._apply_schedules()
 
     def train_mode(self) -> None:
@@ -336,10 +333,7 @@ class KirasPPO(PPO):
         saved = super().save()
         saved["iteration"] = self.iteration
         saved["learning_rate"] = self.learning_rate.item()
-        for name, part in self._parts().items():
-            saved[name] = part.state_dict()
-        if self.sampler:
-            saved["skill_probabilities"] = self.sampler.probabilities
+        saved["parts"] = {name: part.state_dict() for name, part in self.parts.items()}
         return saved
 
     def load(self, loaded_dict: dict, load_cfg: dict | None = None, strict: bool = True) -> bool:
@@ -350,45 +344,23 @@ class KirasPPO(PPO):
         self._rollout.forget()
         self.iteration = loaded_dict["iteration"]
         self.learning_rate.fill_(loaded_dict["learning_rate"])
-        for name, part in self._parts().items():
-            part.load_state_dict(loaded_dict[name])
-        if self.sampler:
-            self.sampler.probabilities = loaded_dict["skill_probabilities"].to(self.device)
+        for name, part in self.parts.items():
+            part.load_state_dict(loaded_dict["parts"][name])
         self._apply_schedules()
         return True
 
     def world_state(self) -> dict:
         """Return what of the statistics belongs to the worlds of this rank; `save` has it, too."""
-        return {name: part.world_state() for name, part in self._recorders().items()}
+        return {name: part.world_state() for name, part in self.parts.items()}
 
     def load_world_state(self, state: dict) -> None:
         """Load what `world_state` returned, or some of it."""
-        recorders = self._recorders()
         for name, values in state.items():
-            recorders[name].load_state_dict(values)
+            self.parts[name].load_world_state(values)
         self._rollout.forget()
 
     def broadcast_parameters(self) -> None:
         """Take the networks of rank 0."""
-        networks: list[nn.Module] = [self.actor, self.critic]
-        networks += [self.estimation.estimator] if self.estimation else []
-        networks += [self.imitation.discriminator] if self.imitation else []
-        networks += [self.reference.policy] if self.reference else []
-        for network in networks:
+        of_parts = (part.networks().values() for part in self.parts.values())
+        for network in (self.actor, self.critic, *chain.from_iterable(of_parts)):
             distributed.broadcast_module(network)
-
-    def _recorders(self) -> dict[str, AdaBoot | PremiumSelector]:
-        recorders: dict[str, AdaBoot | PremiumSelector] = {}
-        if self.estimation:
-            recorders["adaboot"] = self.estimation.adaboot
-        if self.imitation:
-            recorders["selector"] = self.imitation.selector
-        return recorders
-
-    def _parts(self) -> dict[str, SelfImitation | Estimation | Reference]:
-        parts = {
-            "imitation": self.imitation,
-            "estimation": self.estimation,
-            "reference": self.reference,
-        }
-        return {name: part for name, part in parts.items() if part is not None}

@@ -1,18 +1,22 @@
-"""The parts of a learner, built for the observations of an environment."""
+"""What a learner is made of, built for the observations of an environment."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
-import torch
 from rsl_rl.models import MLPModel
+from rsl_rl.utils import resolve_callable
 from tensordict import TensorDict
 from torch import nn
 
 from kiras_rl import interfaces as names
 from kiras_rl.algorithms.estimation import Estimation
+from kiras_rl.algorithms.part import Part, Setting
 from kiras_rl.algorithms.residual import Reference
 from kiras_rl.algorithms.storage import GroupRolloutStorage
+from kiras_rl.config import ConfigError
 from kiras_rl.imitation.self_imitation import SelfImitation
 from kiras_rl.interfaces import SkillEnv
 from kiras_rl.models.critics import GroupCritic
@@ -21,68 +25,106 @@ from kiras_rl.models.precision import uses_bfloat16
 from kiras_rl.schema import LearnerConfig
 from kiras_rl.skills import SkillSampler
 
+KIRAS: dict[str, type[Part]] = {
+    "estimator": Estimation,
+    "imitation": SelfImitation,
+    "skill_init": SkillSampler,
+}
+"""Parts by the blocks of `learner` that configure them; null leaves one out."""
+
+RETENTION = "retention"
+"""The part that `finetuning.retention` configures."""
+
 
 @dataclass(frozen=True)
-class Parts:
-    """What KirasPPO is made of; None is a part that the configuration leaves out.
+class Learner:
+    """What KirasPPO is made of.
 
     Attributes:
-        actor: Its input is proprio and the context, or the history without an estimator.
+        actor: Its input is proprio and the context, or the history where no part adds a context.
         critic: One network a reward group.
         storage: Of a rollout.
-        imitation: Discriminator and premium trajectories.
-        estimation: The context estimator.
-        sampler: Of the skills.
-        reference: The policy of the phase before.
+        parts: By name, in the order in which they are asked.
+        policy: Actor and what the robot needs beside it, sharing their weights.
     """
 
     actor: MLPModel
     critic: GroupCritic
     storage: GroupRolloutStorage
-    imitation: SelfImitation | None
-    estimation: Estimation | None
-    sampler: SkillSampler | None
-    reference: Reference | None
+    parts: dict[str, Part]
+    policy: ExportedPolicy
 
 
-def build_parts(obs: TensorDict, env: SkillEnv, cfg: dict, device: str) -> Parts:
-    """Build networks, storage and statistics.
+def build_learner(obs: TensorDict, env: SkillEnv, cfg: dict, device: str) -> Learner:
+    """Build networks, storage and parts.
 
     Args:
-        obs: A first observation; gains the groups that the learner itself writes.
+        obs: A first observation.
         env: The environment.
         cfg: rsl-rl's dictionary; `learner` holds the LearnerConfig, `iterations` is the length of
             the phase, `retention` holds its RetentionConfig, None in a phase without a reference,
             `reward_scale` the factor of all rewards of a step.
         device: Where networks and storage live.
+
+    Raises:
+        ConfigError: A part that does not exist or does not take its values.
     """
     config: LearnerConfig = cfg["learner"]
-    ppo, retention = config.ppo, cfg["retention"]
     half = uses_bfloat16(config.precision, device)
-    estimation = Estimation.build(config.estimator, obs, env, device)
-    if estimation:
-        obs[names.CONTEXT] = estimation.context(obs)
-    obs[names.NEXT_PROPRIO] = torch.zeros_like(obs[names.PROPRIO])
-    if retention is not None:
-        obs[names.FLAT_ACTION] = torch.zeros(len(obs), env.num_actions, device=device)
-        obs[names.IS_FLAT] = torch.zeros(len(obs), 1, dtype=torch.bool, device=device)
-    imitation = SelfImitation.build(config.imitation, obs, env, ppo.num_steps, half, device)
+    setting = Setting(obs, env, config, device, half, cfg["reward_scale"])
+    parts = {
+        name: kind.build(block, setting) for name, kind, block in _blocks(config, cfg[RETENTION])
+    }
+    for part in parts.values():
+        obs = TensorDict({**obs, **part.groups(obs)}, batch_size=obs.batch_size)
     groups = {
-        "actor": [names.PROPRIO, names.CONTEXT if estimation else names.HISTORY],
+        "actor": [names.PROPRIO, names.CONTEXT if names.CONTEXT in obs else names.HISTORY],
         "critic": [names.CRITIC],
     }
-    count = 2 if imitation is not None and config.multi_critic is not None else 1
-    storage = GroupRolloutStorage(env.num_envs, ppo.num_steps, count, obs, env.num_actions, device)
-    sampler = (
-        SkillSampler(config.skill_init, len(env.skills), device) if config.skill_init else None
-    )
+    count = 1 + len(reward_groups(parts)) if config.multi_critic else 1
+    steps = config.ppo.num_steps
+    storage = GroupRolloutStorage(env.num_envs, steps, count, obs, env.num_actions, device)
     actor = _build_actor(obs, groups, env.num_actions, config).to(device)
-    reference = None
+    onboard = [network for part in parts.values() if (network := part.onboard())]
+    policy = ExportedPolicy(onboard[0] if onboard else None, actor.mlp)
+    for part in parts.values():
+        part.meet(policy)
+    critic = GroupCritic(obs, groups, count, list(config.ppo.critic_dims), half).to(device)
+    return Learner(actor, critic, storage, parts, policy)
+
+
+def reward_groups(parts: dict[str, Part]) -> list[Part]:
+    """Return the parts that bring a reward of their own."""
+    return [part for part in parts.values() if part.reward_group]
+
+
+def _blocks(config: LearnerConfig, retention: Any) -> Iterator[tuple[str, type[Part], Any]]:
+    """Yield name, class and block of every part that is configured."""
+    for name, kind in KIRAS.items():
+        if getattr(config, name) is not None:
+            yield name, kind, getattr(config, name)
+    for name, values in config.parts.items():
+        if values is not None:
+            block = dict(values)
+            yield name, find_part(name, block.pop("class_name", None)), block
     if retention is not None:
-        policy = ExportedPolicy(estimation.estimator if estimation else None, actor.mlp)
-        reference = Reference(policy, retention, cfg["reward_scale"])
-    critic = GroupCritic(obs, groups, count, list(ppo.critic_dims), half).to(device)
-    return Parts(actor, critic, storage, imitation, estimation, sampler, reference)
+        yield RETENTION, Reference, retention
+
+
+def find_part(name: str, class_name: str | None) -> type[Part]:
+    """Return the class that a block of `learner.parts` names, as in package.module:Class.
+
+    Raises:
+        ConfigError: No such class, or one that is no part.
+    """
+    where = f"learner.parts.{name}.class_name={class_name}"
+    try:
+        found = resolve_callable(class_name)
+    except (ImportError, AttributeError, ValueError, TypeError) as error:
+        raise ConfigError(f"{where}: give a class as package.module:Class ({error})") from None
+    if not (isinstance(found, type) and issubclass(found, Part)):
+        raise ConfigError(f"{where}: not a kiras_rl.algorithms.part.Part")
+    return found
 
 
 def _build_actor(

@@ -8,7 +8,8 @@ import torch
 from tensordict import TensorDict
 
 from kiras_rl import interfaces as names
-from kiras_rl.algorithms.parts import Parts
+from kiras_rl.algorithms.part import Outcome
+from kiras_rl.algorithms.parts import Learner
 from kiras_rl.recorded import Recorded, Slot
 
 OUTCOME = (
@@ -27,9 +28,9 @@ class Rollout:
     On a GPU either half is one graph instead of fifty small kernels.
     """
 
-    def __init__(self, parts: Parts, device: str) -> None:
-        """Take the parts, which see every step."""
-        self._parts = parts
+    def __init__(self, learner: Learner, device: str) -> None:
+        """Take the learner, whose parts see every step."""
+        self._learner = learner
         self._seen, self._outcome = SimpleNamespace(), SimpleNamespace()  # of the current step
         self._act = Recorded(self._act_and_write, device, carried=lambda: _slots(self._seen))
         self._store = Recorded(
@@ -43,7 +44,7 @@ class Rollout:
         Raises:
             OverflowError: The rollout is full.
         """
-        self._parts.storage.claim_row()
+        self._learner.storage.claim_row()
         vars(self._seen).update(obs)
         self._outcome.actions = self._act()
         return self._outcome.actions
@@ -67,16 +68,15 @@ class Rollout:
         self._store.forget()
 
     def _act_and_write(self) -> torch.Tensor:
-        """Compute the context once, here: it is an observation of the step as all others are."""
-        parts, seen = self._parts, vars(self._seen)
-        if parts.estimation:
-            seen = seen | {names.CONTEXT: parts.estimation.context(seen)}
-        distribution = parts.actor.distribution
-        distribution.update(parts.actor.mlp(parts.actor.get_latent(seen)))
+        learner, seen = self._learner, vars(self._seen)
+        for part in learner.parts.values():
+            seen = seen | part.observe(seen)
+        distribution = learner.actor.distribution
+        distribution.update(learner.actor.mlp(learner.actor.get_latent(seen)))
         mean, std = distribution.params
         # Not its sample(): torch.normal reads the smallest deviation, and so waits for the device
         actions = mean + std * torch.randn_like(mean)
-        parts.storage.write(
+        learner.storage.write(
             seen,
             actions=actions,
             actions_log_prob=distribution.log_prob(actions),
@@ -86,23 +86,15 @@ class Rollout:
         return actions
 
     def _write_outcome(self) -> tuple[()]:
-        parts, seen, outcome = self._parts, vars(self._seen), vars(self._outcome)
-        rewards, dones = outcome["rewards"], outcome["dones"]
+        storage, outcome = self._learner.storage, vars(self._outcome)
+        given = (outcome[name] for name in ("actions", "rewards", "dones"))
+        step = Outcome(vars(self._seen), *given, extras=outcome)
+        observed: dict[str, torch.Tensor] = {}
+        for part in self._learner.parts.values():
+            observed |= part.record(storage, step)
         time_outs = outcome[names.EXTRA_TIME_OUTS]
-        observed, total = {names.NEXT_PROPRIO: outcome[names.NEXT_PROPRIO]}, rewards
-        if parts.reference:
-            flat_action, residual = parts.reference.judge(seen, outcome["actions"])
-            is_flat = outcome[names.EXTRA_FLAT]
-            observed |= {names.FLAT_ACTION: flat_action, names.IS_FLAT: is_flat}
-            total = rewards + residual
-        parts.storage.write(observed, task_rewards=total, dones=dones, time_outs=time_outs)
-        if parts.imitation:
-            after, valid = outcome[names.EXTRA_IMITATION], outcome[names.EXTRA_VALID]
-            storage = parts.storage
-            parts.imitation.record(storage, seen, after, valid, rewards, dones, time_outs)
-        if parts.estimation:
-            parts.estimation.record(rewards, dones)
-        parts.storage.next_row()
+        storage.write(observed, task_rewards=step.rewards, dones=step.dones, time_outs=time_outs)
+        storage.next_row()
         return ()
 
 

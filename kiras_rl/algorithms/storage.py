@@ -31,6 +31,7 @@ class GroupRolloutStorage(RolloutStorage):
         """Allocate (T, N, ...) buffers."""
         super().__init__("rl", num_envs, num_steps, obs, [num_actions], device)
         shape = (num_steps, num_envs)
+        self.dones = torch.zeros(*shape, 1, device=device)  # floats: an episode may end in part
         self.task_rewards = torch.zeros(*shape, 1, device=device)
         self.time_outs = torch.zeros(*shape, 1, dtype=torch.bool, device=device)
         self.rewards = torch.zeros(*shape, num_groups, device=device)

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 
 import torch
-from tensordict import TensorDict
+from torch import nn
 
 from kiras_rl import distributed
 from kiras_rl import interfaces as names
 from kiras_rl.algorithms.losses import discriminator_loss, gradient_penalty, weights_of
+from kiras_rl.algorithms.part import Iteration, Outcome, Part, Setting
 from kiras_rl.algorithms.storage import GroupRolloutStorage
 from kiras_rl.algorithms.trainer import Trainer
 from kiras_rl.imitation.premium import PremiumSelector
@@ -21,11 +22,13 @@ from kiras_rl.schema import ImitationConfig
 from kiras_rl.shards import Batch, apply
 
 
-class SelfImitation:
+class SelfImitation(Part):
     """What the learner owns to imitate keyframes and its own best motions.
 
     Letters: T steps, N worlds, B pairs of a batch, D features, S skills.
     """
+
+    reward_group = "imitation"
 
     def __init__(
         self,
@@ -82,66 +85,48 @@ class SelfImitation:
         return [*expert, (self, "_skill")]
 
     @classmethod
-    def build(
-        cls,
-        config: ImitationConfig | None,
-        obs: TensorDict,
-        env: SkillEnv,
-        num_steps: int,
-        bfloat16: bool,
-        device: str,
-    ) -> SelfImitation | None:
-        """Build for an environment, or return None where the configuration has no imitation."""
-        if config is None:
-            return None
+    def build(cls, config: ImitationConfig, setting: Setting) -> SelfImitation:
+        """Build for the keyframes of an environment.
+
+        Raises:
+            ConfigError: Unknown rule, or a window shorter than a rollout.
+        """
+        env, device = setting.env, setting.device
         return cls(
             config,
             env.keyframe_features.to(device),
             env.feature_noise.to(device),
             _skill_code(env).to(device),
             env.skills,
-            len(obs),
-            num_steps,
-            bfloat16,
+            env.num_envs,
+            setting.config.ppo.num_steps,
+            setting.bfloat16,
         )
 
-    def record(
-        self,
-        storage: GroupRolloutStorage,
-        before: Mapping[str, torch.Tensor],
-        after: torch.Tensor,
-        valid: torch.Tensor,
-        rewards: torch.Tensor,
-        dones: torch.Tensor,
-        time_outs: torch.Tensor,
-    ) -> None:
-        """Store a step; in place, as a recorded step has to.
+    def record(self, rollout: GroupRolloutStorage, step: Outcome) -> dict[str, torch.Tensor]:
+        """Keep the pair of a step, and let the selector see it.
 
-        Args:
-            storage: Knows which row of the rollout this is.
-            before: Observations before the step.
-            after: Phi after it and before a reset, (N, D): a pair is of one episode.
-            valid: Whether that is one undisturbed motion, (N,) bool.
-            rewards: Task reward, (N,).
-            dones: Ended episodes, (N,).
-            time_outs: Those that the clock ended, (N,) bool.
+        Phi after the step is that before a reset: a pair is of one episode.
         """
-        storage.write_row(self._pairs, torch.cat([before[names.IMITATION], after], dim=-1))
-        storage.write_row(self._valid, valid)
-        failed = dones.bool() & ~time_outs
+        before, after = step.seen, step.extras[names.EXTRA_IMITATION]
+        valid, dones = step.extras[names.EXTRA_VALID], step.dones.bool()
+        rollout.write_row(self._pairs, torch.cat([before[names.IMITATION], after], dim=-1))
+        rollout.write_row(self._valid, valid)
+        failed = dones & ~step.extras[names.EXTRA_TIME_OUTS]
         command, velocity = before[names.COMMAND][:, :2], before[names.VELOCITY][:, :2]
         speed = torch.linalg.vector_norm(command, dim=-1)
         progress = (velocity * command).sum(dim=-1) / speed.clamp(min=1e-6)
-        storage.write_row(self._earned, self._share_earned(speed, progress))
+        rollout.write_row(self._earned, self._share_earned(speed, progress))
         self.selector.record(
             features=after,
             skill=before[names.SKILL].argmax(dim=-1),
-            reward=rewards,
+            reward=step.rewards,
             speed=speed,
             progress=progress,
-            done=dones.bool(),
+            done=dones,
             valid=valid & ~failed,
         )
+        return {}
 
     def _share_earned(self, speed: torch.Tensor, progress: torch.Tensor) -> torch.Tensor:
         """Return the share of the imitation reward that robots get for how they follow, (N,).
@@ -169,11 +154,11 @@ class SelfImitation:
         self._rewards = self.config.reward_weight * imitation_reward(score) * earned
         return self._rewards
 
-    def update(self, storage: GroupRolloutStorage, iteration: int) -> dict[str, float]:
+    def update(self, rollout: GroupRolloutStorage, iteration: Iteration) -> dict[str, float]:
         """Renew the premium buffer, train the discriminator; return scalars for the log."""
-        one_hot = storage.observations[names.SKILL]
-        scalars = self._describe(one_hot)
-        self.selector.select(iteration)
+        one_hot = rollout.observations[names.SKILL]
+        scalars = self._describe_rewards(one_hot)
+        self.selector.select(iteration.number)
         self._skill = one_hot.flatten(0, 1).argmax(dim=-1)
         loss, expert, policy = self.trainer.train(self.config.discriminator.updates).tolist()
         scalars |= {
@@ -181,7 +166,7 @@ class SelfImitation:
             "Discriminator/expert": expert,
             "Discriminator/policy": policy,
         }
-        return scalars | self._describe_buffer(iteration)
+        return scalars | self._describe_buffer(iteration.number)
 
     def _batches(self) -> Iterator[Batch]:
         """Draw the one batch of an update.
@@ -227,7 +212,7 @@ class SelfImitation:
             loss = loss + steepness * gradient_penalty(self.discriminator, between, self._smooth)
         return loss, torch.stack([loss, expert_score.mean(), policy_score.mean()])
 
-    def _describe(self, one_hot: torch.Tensor) -> dict[str, float]:
+    def _describe_rewards(self, one_hot: torch.Tensor) -> dict[str, float]:
         """Return the mean imitation reward of each skill over the rollout."""
         count = distributed.total(one_hot.sum(dim=(0, 1))).clamp(min=1.0)
         sums = distributed.total((self._rewards.unsqueeze(-1) * one_hot).sum(dim=(0, 1)))
@@ -246,6 +231,10 @@ class SelfImitation:
             **_by_skill("Premium/count", self._skills, count),
         }
 
+    def networks(self) -> dict[str, nn.Module]:
+        """Return the discriminator."""
+        return {"discriminator": self.discriminator}
+
     def state_dict(self) -> dict:
         """Return networks, optimizer and buffers."""
         return {
@@ -259,6 +248,14 @@ class SelfImitation:
         self.discriminator.load_state_dict(state["discriminator"])
         self.trainer.load_state_dict(state["optimizer"])
         self.selector.load_state_dict(state["selector"])
+
+    def world_state(self) -> dict:
+        """Return the windows that are being recorded."""
+        return self.selector.world_state()
+
+    def load_world_state(self, state: dict) -> None:
+        """Take the windows that were being recorded."""
+        self.selector.load_state_dict(state)
 
 
 def _skill_code(env: SkillEnv) -> torch.Tensor:

@@ -8,6 +8,7 @@ from tensordict import TensorDict
 
 from kiras_rl import interfaces as names
 from kiras_rl.algorithms.estimation import Estimation
+from kiras_rl.algorithms.part import Iteration, Outcome
 from kiras_rl.algorithms.storage import GroupRolloutStorage
 from kiras_rl.config import ConfigError
 from kiras_rl.models.estimator import ContextEstimator
@@ -15,6 +16,7 @@ from kiras_rl.schema import EstimatorConfig
 
 STEPS, WORLDS, PROPRIO, FRAMES, SKILLS, LATENT = 8, 64, 4, 2, 2, 3
 RATE = torch.tensor(3e-3)  # of the actor
+ONE, FOUR = (Iteration(number=0, mini_batches=count, actor_rate=RATE) for count in (1, 4))
 
 
 @pytest.fixture
@@ -51,7 +53,7 @@ def storage():
 
 def test_it_learns_to_tell_the_velocity(make_estimation, storage):
     estimation = make_estimation()
-    errors = [estimation.update(storage, 4, RATE)["Estimator/velocity"] for _ in range(100)]
+    errors = [estimation.update(storage, FOUR)["Estimator/velocity"] for _ in range(100)]
     assert errors[0] > 1.5  # the variance of a difference of two normal numbers is 2
     assert errors[-1] < 0.1
 
@@ -60,9 +62,9 @@ def test_the_frame_after_an_end_is_not_predicted(make_estimation, storage):
     ended = storage.dones > 0
     target = storage.observations[names.NEXT_PROPRIO]
     target.copy_(torch.where(ended, 1e6, target))
-    assert make_estimation().update(storage, 1, RATE)["Estimator/prediction"] < 10.0
+    assert make_estimation().update(storage, ONE)["Estimator/prediction"] < 10.0
     target.copy_(torch.where(ended, target, 1e3))
-    assert make_estimation().update(storage, 1, RATE)["Estimator/prediction"] > 1e5
+    assert make_estimation().update(storage, ONE)["Estimator/prediction"] > 1e5
 
 
 def test_the_prior_starts_standard_normal_and_follows_the_latents(make_estimation, storage):
@@ -70,15 +72,17 @@ def test_the_prior_starts_standard_normal_and_follows_the_latents(make_estimatio
     skill = torch.eye(SKILLS)
     mean, log_var = estimation.estimator.prior_of(skill)
     assert not mean.any() and not log_var.any()
-    estimation.update(storage, 4, RATE)
+    estimation.update(storage, FOUR)
     assert estimation.estimator.prior_of(skill)[0].abs().min() > 0
 
 
 def test_a_withheld_update_changes_nothing(make_estimation, storage):
     estimation = make_estimation("gate_update", floor=0.0)
-    estimation.record(torch.full((WORLDS,), -1.0), torch.ones(WORLDS))  # no trust at all
+    extras = {names.NEXT_PROPRIO: torch.zeros(WORLDS, PROPRIO)}
+    poor = torch.full((WORLDS,), -1.0)  # no trust at all
+    estimation.record(storage, Outcome({}, poor[:, None], poor, torch.ones(WORLDS), extras))
     before = [p.clone() for p in estimation.estimator.parameters()]
-    assert estimation.update(storage, 4, RATE) == {"AdaBoot/trust": 0.0, "AdaBoot/trained": 0.0}
+    assert estimation.update(storage, FOUR) == {"AdaBoot/trust": 0.0, "AdaBoot/trained": 0.0}
     for old, new in zip(before, estimation.estimator.parameters(), strict=True):
         assert torch.equal(old, new)
 

@@ -38,29 +38,29 @@ def test_it_begins_with_the_networks_of_skill_learning(begin, overrides):
     assert same(first.actor.mlp, alg.actor.mlp)
     assert same(first.critic.critics[TASK], alg.critic.critics[TASK])
     assert same(first.policy(), alg.policy())
-    assert same(first.policy(), alg.reference.policy)
+    assert same(first.policy(), alg.parts["retention"].policy)
     assert alg.learning_rate == first.learning_rate
 
 
 def test_self_imitation_and_its_critic_are_gone(begin):
     alg = begin()[1].alg
-    assert alg.imitation is None
+    assert "imitation" not in alg.parts
     assert len(alg.critic.critics) == 1
     assert alg.storage.rewards.shape[-1] == 1
 
 
 def test_skill_probabilities_go_on(begin):
     first, runner = begin()
-    assert torch.equal(first.sampler.probabilities, runner.alg.sampler.probabilities)
-    assert not torch.allclose(first.sampler.probabilities, torch.tensor([0.5, 0.5]), atol=1e-5)
+    assert torch.equal(first.skill_probabilities, runner.alg.skill_probabilities)
+    assert not torch.allclose(first.skill_probabilities, torch.tensor([0.5, 0.5]), atol=1e-5)
 
 
 def test_the_reference_stays_while_the_policy_moves(begin):
     first, runner = begin()
     scalars = []
     runner.learn(2, on_iteration=lambda status: scalars.append(status.scalars))
-    assert same(first.policy(), runner.alg.reference.policy)
-    assert not same(runner.alg.policy(), runner.alg.reference.policy)
+    assert same(first.policy(), runner.alg.parts["retention"].policy)
+    assert not same(runner.alg.policy(), runner.alg.parts["retention"].policy)
     assert scalars[0]["Residual/distance"] == pytest.approx(0.0, abs=1e-6)
     assert scalars[1]["Residual/distance"] > 1e-4
 
@@ -69,7 +69,8 @@ def test_the_residual_reward_is_the_distance_of_what_was_done(make_runner):
     alg = make_runner().alg
     obs = alg.storage.observations[0].clone()
     mean = alg.policy()(obs["proprio"], obs["history"])[0].detach()
-    reference = Reference(alg.policy(), RetentionConfig(0.15, 1.0), reward_scale=0.02)
+    reference = Reference(RetentionConfig(0.15, 1.0), num_actions=2, reward_scale=0.02)
+    reference.meet(alg.policy())
     away = mean + torch.tensor([0.3, -0.4])  # 0.5 from the reference
     flat, reward = reference.judge(obs, away)
     assert torch.allclose(reward, torch.tensor(-0.15 * 0.02 * 0.5), atol=1e-7)
@@ -111,5 +112,5 @@ def test_a_saved_finetuning_goes_on(begin):
     other = begin()[1]
     other.alg.load(runner.alg.save())
     assert same(other.alg.policy(), runner.alg.policy())
-    assert same(other.alg.reference.policy, first.policy())
+    assert same(other.alg.parts["retention"].policy, first.policy())
     assert other.alg.iteration == 2

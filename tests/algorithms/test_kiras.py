@@ -10,10 +10,11 @@ import pytest
 import torch
 
 from kiras_rl import interfaces as names
-from kiras_rl.algorithms.kiras import IMITATION, TASK
+from kiras_rl.algorithms.kiras import TASK
 from kiras_rl.config import ConfigError
 from kiras_rl.phases import FINETUNING, SKILL_LEARNING
 
+IMITATION = 1  # reward group
 PARTS = ("imitation", "multi_critic", "estimator", "skill_init")
 
 
@@ -24,10 +25,8 @@ def null(*parts):
 def networks(alg):
     """Return every trained tensor by name."""
     modules = {"actor": alg.actor, "critic": alg.critic}
-    if alg.imitation:
-        modules["discriminator"] = alg.imitation.discriminator
-    if alg.estimation:
-        modules["estimator"] = alg.estimation.estimator
+    for part in alg.parts.values():
+        modules |= part.networks()
     return {f"{m}.{k}": v for m, module in modules.items() for k, v in module.named_parameters()}
 
 
@@ -61,7 +60,7 @@ def test_the_estimator_takes_steps_in_proportion_to_those_of_the_actor(make_runn
     )
     runner.learn(1)
     assert runner.alg.learning_rate == pytest.approx(rate)
-    [group] = runner.alg.estimation.trainer.optimizer.param_groups
+    [group] = runner.alg.parts["estimator"].trainer.optimizer.param_groups
     assert group["lr"] == pytest.approx(0.3 * rate)
 
 
@@ -116,7 +115,7 @@ def test_the_log_tells_how_far_the_advantages_of_each_group_spread(make_runner):
 def test_no_pair_of_features_straddles_a_reset(make_runner):
     runner = make_runner()
     pairs = []
-    hook = runner.alg.imitation.discriminator.register_forward_pre_hook(
+    hook = runner.alg.parts["imitation"].discriminator.register_forward_pre_hook(
         lambda _, args: pairs.append(args[0].clone())
     )
     collect(runner)
@@ -147,9 +146,8 @@ def test_one_critic_learns_the_sum_of_both_rewards(make_runner):
     for runner in (two, one, task):
         if runner is not two:  # the same networks act and judge
             runner.alg.actor.load_state_dict(two.alg.actor.state_dict())
-            for name in ("estimation", "imitation"):
-                part = getattr(two.alg, name)
-                getattr(runner.alg, name).load_state_dict(copy.deepcopy(part.state_dict()))
+            for name, part in runner.alg.parts.items():
+                part.load_state_dict(copy.deepcopy(two.alg.parts[name].state_dict()))
         torch.manual_seed(2)
         runner.env.observe()
         collect(runner)
@@ -189,9 +187,9 @@ def test_skills_are_drawn_by_their_task_values(make_runner):
     task_critic.mlp[-1].weight.data[0, 0] = 1.0
     keyframes = torch.zeros(2, 3, 5)
     keyframes[..., 0] = torch.tensor([[1.0, 1.0, 4.0], [5.0, 6.0, 7.0]])  # means 2 and 6
-    torch.testing.assert_close(
-        runner.alg.skill_probabilities(keyframes), torch.tensor([1 - 2 / 8, 1 - 6 / 8])
-    )
+    runner.alg.choose_skills(keyframes)
+    drawn = runner.alg.skill_probabilities
+    torch.testing.assert_close(drawn, torch.tensor([1 - 2 / 8, 1 - 6 / 8]))
 
 
 def test_bfloat16_changes_values_by_its_rounding_alone(make_runner):
@@ -223,15 +221,15 @@ def test_a_saved_learner_goes_on(make_runner):
     assert torch.equal(other.alg.act_deterministic(obs), runner.alg.act_deterministic(obs))
     again = other.alg.save()
     assert again.keys() == saved.keys()
-    assert torch.equal(again["skill_probabilities"], saved["skill_probabilities"])
+    assert torch.equal(*(x["parts"]["skill_init"]["probabilities"] for x in (again, saved)))
 
 
 @pytest.mark.parametrize("phase", [SKILL_LEARNING, FINETUNING])
 def test_replayed_rollouts_and_updates_are_the_same(make_runner, taped, phase):
     plain, replayed = (make_runner("learner.estimator.epochs=3", phase=phase) for _ in range(2))
     recorded = [replayed.alg._rollout._act, replayed.alg._rollout._store]
-    parts = [replayed.alg, replayed.alg.estimation, replayed.alg.imitation]
-    recorded += [part.trainer._pass for part in parts if part]
+    trained = [replayed.alg, *replayed.alg.parts.values()]
+    recorded += [part.trainer._pass for part in trained if hasattr(part, "trainer")]
     for part in recorded:
         part.records = True
     for runner in (plain, replayed):

@@ -65,9 +65,9 @@ def test_widths_are_those_of_the_preset(build_env, cfg, proprio, critic, imitati
     assert env.keyframe_observations().shape == (5, 3, critic)
     alg = KirasRunner(env, load_config(cfg), None, "cpu").alg
     assert widths(alg.actor.mlp) == (actor, 8)
-    assert widths(alg.estimation.estimator.encoder) == (4 * proprio, 3 + 2 * 8)
-    assert widths(alg.estimation.estimator.decoder) == (8 + 5, proprio)
-    assert widths(alg.imitation.discriminator) == (2 * imitation, 1)
+    assert widths(alg.parts["estimator"].estimator.encoder) == (4 * proprio, 3 + 2 * 8)
+    assert widths(alg.parts["estimator"].estimator.decoder) == (8 + 5, proprio)
+    assert widths(alg.parts["imitation"].discriminator) == (2 * imitation, 1)
     assert widths(alg.critic.critics[0]) == (critic, 1)
 
 

@@ -7,6 +7,7 @@ import torch
 from tensordict import TensorDict
 
 from kiras_rl import interfaces as names
+from kiras_rl.algorithms.part import Iteration, Outcome
 from kiras_rl.algorithms.storage import GroupRolloutStorage
 from kiras_rl.config import load_config
 from kiras_rl.imitation.self_imitation import SelfImitation
@@ -37,6 +38,10 @@ def make_imitation():
     return make
 
 
+def at(iteration):
+    return Iteration(iteration, mini_batches=1, actor_rate=torch.tensor(0.0))
+
+
 def rollout(imitation, shift, valid=True, velocity=0.3):
     """Hold every world in its keyframe plus `shift`; return the last rewards and the storage."""
     skill = torch.arange(WORLDS) % 2
@@ -54,15 +59,12 @@ def rollout(imitation, shift, valid=True, velocity=0.3):
     zero = torch.zeros(WORLDS)
     for _ in range(STEPS):
         storage.write(before)
-        imitation.record(
-            storage,
-            before,
-            after=features,
-            valid=torch.full((WORLDS,), valid),
-            rewards=zero,
-            dones=zero,
-            time_outs=zero.bool(),
-        )
+        extras = {
+            names.EXTRA_IMITATION: features,
+            names.EXTRA_VALID: torch.full((WORLDS,), valid),
+            names.EXTRA_TIME_OUTS: zero.bool(),
+        }
+        imitation.record(storage, Outcome(before, zero[:, None], zero, zero, extras))
         storage.next_row()
     return imitation.rewards()[-1], storage
 
@@ -77,7 +79,7 @@ def test_it_tells_a_shifted_motion_from_the_keyframes(make_imitation, bfloat16):
     imitation = make_imitation(bfloat16=bfloat16)
     for iteration in range(60):
         first, storage = rollout(imitation, [0.0, 0.5])
-        scalars = imitation.update(storage, iteration)
+        scalars = imitation.update(storage, at(iteration))
     assert scalars["Discriminator/expert"] > 0.8
     assert scalars["Discriminator/policy"] < -0.8
     assert first.max() < 0.3  # what the policy does earns little,
@@ -98,7 +100,7 @@ def test_the_gradient_penalty_keeps_the_slope_low(make_imitation):
     imitation = make_imitation("learner.imitation.discriminator.gradient_penalty=1")
     for iteration in range(40):
         _, storage = rollout(imitation, [0.0, 0.5])
-        scalars = imitation.update(storage, iteration)
+        scalars = imitation.update(storage, at(iteration))
     # A line of slope s in both frames scores +-s/2 half a unit apart, and its squared gradient is
     # 2 s^2: 2 (1 - s/2)^2 + 2 s^2 is least at s = 2/5.
     assert scalars["Discriminator/expert"] == pytest.approx(0.2, abs=0.02)
@@ -109,7 +111,7 @@ def test_the_gradient_penalty_keeps_the_slope_low(make_imitation):
 def test_premium_motions_go_where_they_are_told(make_imitation, velocity, is_gait):
     imitation = make_imitation(f"learner.imitation.premium.window={STEPS}")
     _, storage = rollout(imitation, [0.0, 0.0], velocity=velocity)
-    scalars = imitation.update(storage, 0)
+    scalars = imitation.update(storage, at(0))
     assert (scalars["Premium/count_a"] > 0) is is_gait
 
 
@@ -131,7 +133,7 @@ def test_a_robot_slower_than_half_of_the_command_earns_in_proportion(
 def test_the_reward_is_logged_by_skill(make_imitation):
     imitation = make_imitation()
     rewards, storage = rollout(imitation, [0.0, 0.5])
-    scalars = imitation.update(storage, 0)
+    scalars = imitation.update(storage, at(0))
     assert scalars["Imitation/reward_a"] == pytest.approx(rewards[::2].mean().item())
     assert scalars["Imitation/reward_b"] == pytest.approx(rewards[1::2].mean().item())
 
@@ -141,7 +143,7 @@ def test_steps_that_do_not_count_earn_and_teach_nothing(make_imitation):
     for iteration in range(30):
         rewards, storage = rollout(imitation, [0.0, 0.5], valid=False)
         assert not rewards.any()
-        imitation.update(storage, iteration)
+        imitation.update(storage, at(iteration))
     with torch.no_grad():
         score = imitation.discriminator(storage.observations[names.IMITATION][0].repeat(1, 2))
     assert score.min() > 0.5  # only experts pull, and they pull up
@@ -158,7 +160,7 @@ def test_what_has_no_noise_is_smooth_as_well(make_imitation, monkeypatch):
     weight = "learner.imitation.discriminator.gradient_penalty=1"
     imitation = make_imitation(weight, noise=0.0)
     _, storage = rollout(imitation, (1.0, 1.0))
-    imitation.update(storage, 0)
+    imitation.update(storage, at(0))
     assert seen and all(features == 2 * [True, True, False, False] for features in seen)
 
 
@@ -172,7 +174,7 @@ def test_the_instance_noise_shrinks_with_progress(make_imitation):
             lambda _, args, seen=seen: seen.append(args[0].detach())
         )
         imitation.set_progress(progress)
-        imitation.update(storage, 0)
+        imitation.update(storage, at(0))
         hook.remove()
         policy = torch.cat([batch[256:] for batch in seen if len(batch) == 512])
         spreads.append(policy[:, 1].std().item())  # 0.5 in every pair

@@ -10,7 +10,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import wraps
+from functools import reduce, wraps
 from itertools import pairwise
 from statistics import median
 from typing import Any
@@ -27,14 +27,14 @@ from kiras_rl.tools.benchmarks.request import Figures, Request, native
 from kiras_rl.tools.benchmarks.tables import make_table, verdict, with_range
 from kiras_rl.tools.benchmarks.training import Training
 from kiras_rl.tools.benchmarks.workload import bare_steps
-from kiras_rl.tools.timing import interleave, summarise
+from kiras_rl.tools.timing import child, interleave, summarise
 
 ITERATION, PHYSICS = "iteration", "bare physics"
 TARGET = 0.85  # of the bound's speed
 UPDATES = (
     ("policy", "_update_policy"),
-    ("estimator", "estimation.update"),
-    ("discriminator", "imitation.update"),
+    ("estimator", "parts.estimator.update"),
+    ("discriminator", "parts.imitation.update"),
 )
 """(network, method of the learner that trains it)."""
 
@@ -129,7 +129,7 @@ def count_operations(training: Training) -> dict[str, int]:
     alg, counts, wrapped = training.runner.alg, {}, []
     for network, path in UPDATES:
         *owners, method = path.split(".")
-        owner = getattr(alg, owners[0]) if owners else alg
+        owner = reduce(child, owners, alg)
         if owner is not None:
             setattr(owner, method, _counted(getattr(owner, method), network, counts))
             wrapped.append((owner, method))

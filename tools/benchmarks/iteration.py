@@ -25,13 +25,13 @@ PARTS = (
     ),
     ("alg", "act", "act"),
     ("alg", "process_env_step", "record"),
-    ("alg.imitation", "rewards", "imitation scoring"),
-    ("alg.imitation.selector", "record", "premium windows"),
-    ("alg.reference", "judge", "residual reward"),
+    ("alg.parts.imitation", "rewards", "imitation scoring"),
+    ("alg.parts.imitation.selector", "record", "premium windows"),
+    ("alg.parts.retention", "judge", "residual reward"),
     ("alg", "compute_returns", "returns"),
     ("alg", "_update_policy", "policy update"),
-    ("alg.estimation", "update", "estimator"),
-    ("alg.imitation", "update", "discriminator"),
+    ("alg.parts.estimator", "update", "estimator"),
+    ("alg.parts.imitation", "update", "discriminator"),
 )
 """(owner, method, part): what an iteration is divided into; what is none of them is the rest.
 
