@@ -63,7 +63,7 @@ def make_env(name: str, *overrides: str):
 def test_there_is_one_diff_an_example(extended):
     import kiras_rl
 
-    assert len(DIFFS) == len(re.findall(r"^## ", PAGE, re.MULTILINE)) == 7
+    assert len(DIFFS) == len(re.findall(r"^## ", PAGE, re.MULTILINE)) == 8
     assert Path(kiras_rl.__file__).is_relative_to(extended)
 
 
@@ -166,6 +166,18 @@ def test_a_terrain_is_a_function_and_a_line():
     x = torch.tensor([0.6, 1.0, 1.4])  # trough, crest and trough of a wave 0.8 m long
     heights = ground.heights(torch.stack([x, torch.zeros(3)], dim=1)[None])[0]
     torch.testing.assert_close(heights, torch.tensor([0.0, 0.15, 0.0]), atol=6e-3, rtol=0.0)
+
+
+def test_a_part_of_the_learner_is_a_class_and_a_line():
+    from kiras_rl.algorithms.kiras import KirasPPO
+    from kiras_rl.phases import SKILL_LEARNING, rsl_rl_config
+
+    env, config = make_env("solo8_bounded")
+    settings = rsl_rl_config(config, SKILL_LEARNING, env.step_dt)
+    alg = KirasPPO.construct_algorithm(env.get_observations(), env, settings, "cpu")
+    mean = torch.tensor([[5.0, -8.0], [0.0, 5.5]])
+    loss = alg.parts["bounds"].policy_loss(mean, {})
+    assert loss == pytest.approx(0.01 * (9.0 + 0.25) / 2)
 
 
 def test_an_ablation_is_a_file():

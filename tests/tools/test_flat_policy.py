@@ -51,7 +51,7 @@ def test_finetuning_begins_from_the_best_policy(learned, tmp_path, capsys):
     latest = run / "checkpoints" / "latest.pt"
     source, content = load_checkpoint(best), load_checkpoint(latest)
     assert (content["phase"], content["iteration"]) == ("finetuning", 7 + 1)
-    reference, policy = content["learner"]["reference"], source["policy"]
+    reference, policy = content["learner"]["parts"]["retention"], source["policy"]
     assert reference.keys() == policy.keys()
     assert all(torch.equal(reference[name], policy[name]) for name in policy)
     provenance = content["description"]["provenance"]
