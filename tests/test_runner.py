@@ -117,8 +117,8 @@ def test_a_resumed_training_ends_with_the_same_bits(make_runner):
     assert one["iteration"] == other["iteration"] == 6
     for part in ("learner", "env", "generators", "policy"):
         assert differences(one[part], other[part], part) == []
-    assert one["learner"]["imitation"]["selector"]["scores"].isfinite().any()
-    assert one["learner"]["estimation"]["adaboot"]["ready"]
+    assert one["learner"]["parts"]["imitation"]["selector"]["scores"].isfinite().any()
+    assert one["learner"]["parts"]["estimator"]["adaboot"]["ready"]
 
 
 def test_a_training_resumed_anywhere_in_both_phases_ends_with_the_same_bits(make_runner):
