@@ -47,8 +47,8 @@ class Curriculum:
         self.kind = torch.searchsorted(edges, middle.double()).clamp(max=len(library.types) - 1)
         flat = library.types.index("flat") if "flat" in library.types else -1
         self.is_flat = self.kind == flat
-        rough = [k for k in range(len(library.types)) if k != flat]
-        self._rough = torch.tensor(rough, device=device)
+        trained = [k for k, share in enumerate(library.proportions) if share > 0 and k != flat]
+        self._trained = torch.tensor(trained, dtype=torch.int64, device=device)  # rough types
         self._num_skills = num_skills
         self.level = torch.zeros_like(self.kind)
         self._way = torch.zeros(n, device=device)
@@ -125,15 +125,18 @@ class Curriculum:
         return self._library.index(self.kind, self.level, variant)
 
     def describe(self, skills: tuple[str, ...]) -> dict[str, torch.Tensor]:
-        """Return by log name mean frontiers of types and skills, and shares of success by level."""
+        """Return by log name mean frontiers of types and skills, and shares of success by level.
+
+        Those of skills and levels are over the rough types that are trained on.
+        """
         frontier = self.frontier.float()
-        by_type, by_skill = frontier.mean(1).unbind(), frontier[self._rough].mean(0).unbind()
+        by_type, by_skill = frontier.mean(1).unbind(), frontier[self._trained].mean(0).unbind()
         log = {
             f"Terrain/level_{name}": mean
             for names, values in ((self._library.types, by_type), (skills, by_skill))
             for name, mean in zip(names, values, strict=True)
         }
-        tries, successes = (x[self._rough].sum((0, 1)) for x in (self._tries, self._successes))
+        tries, successes = (x[self._trained].sum((0, 1)) for x in (self._tries, self._successes))
         shares = (successes / tries.clamp(min=1.0)).unbind()
         return log | {f"Terrain/success_level_{k}": share for k, share in enumerate(shares)}
 

@@ -46,7 +46,7 @@ _KEYS = (
 )
 _OPTIONAL_KEYS = ("joint_limits", "velocity_limit", "motor", "clearance", "variants")
 _MOTOR_KEYS = ("stall_torque", "no_load_speed")
-_CLEARANCE_SHARE = 1 / 3  # of the base height that feet should clear at most
+_CLEARANCE_SHARE = 1 / 3  # of the base height: more than that no step has to clear
 _USUAL_CLEARANCE = 0.3  # of the first keyframe's base height, where robot.yaml gives none
 _VARIANT = ":"  # between the names of a robot and of one of its variants
 
