@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import importlib
 import tomllib
 from pathlib import Path
 
@@ -70,11 +71,16 @@ def test_the_onboard_part_is_of_this_version_and_of_old_pythons():
             assert not newer, f"{path}: zip(strict=) is of Python 3.10"
 
 
-def test_every_command_names_a_module_of_tools():
-    modules = {script.split(":")[0] for script in PROJECT["project"]["scripts"].values()}
-    missing = [
-        module
-        for module in sorted(modules)
-        if not (FOLDERS["kiras_rl.tools"] / f"{module.rpartition('.')[2]}.py").is_file()
-    ]
+def test_every_command_names_a_function_that_is_there():
+    missing = []
+    for script in PROJECT["project"]["scripts"].values():
+        module, _, function = script.partition(":")
+        if not callable(getattr(importlib.import_module(module), function, None)):
+            missing.append(script)
     assert not missing
+
+
+def test_the_onboard_part_has_the_command_that_drives_robots():
+    onboard = tomllib.loads((ROOT / "onboard" / "pyproject.toml").read_text(encoding="utf-8"))
+    command = onboard["project"]["scripts"]["kiras-robot"]
+    assert command == PROJECT["project"]["scripts"]["kiras-robot"]

@@ -1,0 +1,1 @@
+"""What runs a policy on a robot: driver, runtime and operator, three processes."""
