@@ -39,13 +39,16 @@ class Rig:
         folder: Path,
         seed: int = 0,
         wrap: Callable[[Link], Link] = lambda link: link,
+        world: Callable[[Rig], Link] | None = None,
     ) -> None:
         self.policy = OnboardPolicy(shipped(robot))
         self.profile = profile_of(robot)
         self.plant = Plant(self.policy.metadata, self.profile, seed)
         self.channel = Channel(robot, folder)
         self.channel.runtime.take()
-        self.link = wrap(SimulatedRobot(self.plant, self.profile.rate))
+        self.electronics = None  # what stands between the wire and the plant
+        made = world(self) if world else SimulatedRobot(self.plant, self.profile.rate)
+        self.link = wrap(made)
         self.ring = Ring(self.channel.ring, round(60 * self.profile.rate))
         self.log: list[str] = []
         self.driver = Driver(self.link, self.channel, self.ring, self.log.append)
@@ -64,6 +67,8 @@ class Rig:
             if self._tick % each == 0:
                 self._hand()
                 self._run_runtime()
+            if self.electronics is not None:
+                self.electronics.step(self.now)
             self.driver.tick(self.now)
             self.modes.append(self.driver.mode)
             self.speed = max(self.speed, float(np.linalg.norm(self.plant.data.qvel[:3])))
@@ -84,8 +89,9 @@ class Rig:
 
     def walk(self, skill: str = "walk", command: tuple[float, float, float] = (0.0, 0.0, 0.0)):
         """Go from where it lies to the policy."""
-        self.run(0.8)
-        self.press(Request.ACKNOWLEDGE)
+        if self.runtime.state == State.OFF:
+            self.run(0.8)
+            self.press(Request.ACKNOWLEDGE)
         self.run_until(State.LYING)
         self.press(Request.STAND)
         self.run_until(State.STANDING)

@@ -12,14 +12,18 @@ from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
+import numpy as np
+
 from kiras_rl.deploy.metadata import PolicyError
 from kiras_rl.deploy.policy import OnboardPolicy
 from kiras_rl.deploy.runtime.blackbox import LENGTH, Ring
 from kiras_rl.deploy.runtime.driver import Channel, Driver, Link, LinkError, keep_pace
+from kiras_rl.deploy.runtime.go1 import Go1
 from kiras_rl.deploy.runtime.machine import Runtime
 from kiras_rl.deploy.runtime.mailbox import SHARED, BusyError
 from kiras_rl.deploy.runtime.messages import NANO, State
 from kiras_rl.deploy.runtime.profiles import Profile, profile_of
+from kiras_rl.deploy.runtime.solo8 import Solo8, open_socket, read_calibration
 
 PRIORITIES = {"driver": 80, "runtime": 70}  # of SCHED_FIFO, where the system lets us have it
 ALONE = 30.0  # s that a runtime whose operator is gone waits, lying, before it ends
@@ -37,7 +41,7 @@ class Setup:
     log: str
     """The file that events are appended to."""
     address: str = ""
-    """Of the robot: host:port on Go1, a network interface on Solo-8; empty for the usual one."""
+    """Of the robot: host:port on Go1, empty for its usual one; a network interface on Solo-8."""
     calibration: str = ""
     """Solo-8: the file with the angles of the joints at their encoders' index."""
     deadman: bool = False
@@ -81,7 +85,11 @@ def open_link(setup: Setup, policy: OnboardPolicy, profile: Profile) -> Link:
                 "the onboard package alone drives real robots"
             ) from None
         return SimulatedRobot(Plant(policy.metadata, profile, setup.seed), profile.rate)
-    raise LinkError(f"there is no driver '{setup.link}'; there are: sim")
+    joints, torque = policy.metadata.num_joints, np.array(policy.metadata.torque_limit)
+    if setup.link == "go1":
+        return Go1(setup.address, joints, profile.damping)
+    offsets = read_calibration(setup.calibration)
+    return Solo8(open_socket(setup.address), offsets, torque, profile.damping)
 
 
 def drive(setup: Setup) -> None:
