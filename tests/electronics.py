@@ -7,14 +7,29 @@ tests compare with the makers' own libraries.
 from __future__ import annotations
 
 import socket
+from collections.abc import Callable
 
 import numpy as np
+from rig import Rig
 
 from kiras_rl.deploy.runtime import go1, solo8
-from kiras_rl.deploy.runtime.messages import NANO, Mode, make_reading
+from kiras_rl.deploy.runtime.messages import NANO, Mode, Request, State, make_reading
 from kiras_rl.deploy.runtime.simulated import Plant
 
 MS = NANO // 1000
+Spoil = Callable[[bytes, int], list[bytes]]  # a message and the time in ns -> what arrives of it
+
+
+def whole(message: bytes, now: int) -> list[bytes]:
+    return [message]
+
+
+def drain(wire: socket.socket) -> None:
+    try:
+        while True:
+            wire.recv(4096)
+    except OSError:
+        return
 
 
 class Go1Electronics:
@@ -25,6 +40,7 @@ class Go1Electronics:
         level: LOW_LEVEL, or what it is in while the maker's own controller walks.
         remote: The 40 bytes of its remote.
         plugged: Whether the cable is in.
+        spoil: What the way to the driver does to messages.
     """
 
     def __init__(self, plant: Plant, rate: float = 500.0) -> None:
@@ -34,6 +50,7 @@ class Go1Electronics:
         self._socket.setblocking(False)
         self.port = self._socket.getsockname()[1]
         self.level, self.remote, self.plugged = go1.LOW_LEVEL, bytes(40), True
+        self.spoil: Spoil = whole
         self._peer = None
         self._action = (Mode.OFF, *np.zeros((3, 12)))
         self._reading = make_reading()
@@ -45,7 +62,11 @@ class Go1Electronics:
             self._plant.step(self._action)
         self._tick += self._steps  # ms
         if self._peer is not None and self.plugged:
-            self._socket.sendto(self._state(), self._peer)
+            for message in self.spoil(self._state(), now):
+                self._socket.sendto(message, self._peer)
+
+    def drain(self) -> None:
+        drain(self._socket)
 
     def close(self) -> None:
         self._socket.close()
@@ -90,6 +111,7 @@ class MasterBoard:
         zero: Angle of each joint where its encoder's index is, rad.
         plugged: Whether the cable is in.
         errors: The error code in each board's status.
+        spoil: What the way to the driver does to messages.
     """
 
     TIMEOUT = 20 * MS  # CONFIG_WIFI_ETH_TIMEOUT_CONTROL of the firmware
@@ -110,6 +132,7 @@ class MasterBoard:
         self.state, self.plugged, self.errors = "waiting", True, np.zeros(6, np.uint16)
         self._reading = make_reading()
         self._before = start.copy()
+        self.spoil: Spoil = whole
 
     def step(self, now: int) -> None:
         if self.plugged:
@@ -123,7 +146,12 @@ class MasterBoard:
             self._send(solo8.ANSWER.pack(self._session, 0b1111))
         else:
             self._count += 1
-            self._send(self._sensor().tobytes())
+            for message in self.spoil(self._sensor().tobytes(), now):
+                self._send(message)
+
+    def drain(self) -> None:
+        drain(self._own)
+        drain(self.wire)
 
     def close(self) -> None:
         self._own.close()
@@ -204,6 +232,34 @@ class MasterBoard:
         sensor["acc"] = np.rint(reading["acc"] / 9.80665 * 2**11)
         sensor["attitude"] = np.rint(np.array(_euler(reading["quat"])) * 2**13)
         return sensor
+
+
+def go1_world(rig: Rig) -> go1.Go1:
+    """Put a Go1's electronics and our driver's link to it into a rig."""
+    rig.electronics = Go1Electronics(rig.plant)
+    return go1.Go1(f"127.0.0.1:{rig.electronics.port}", 12, rig.profile.damping, 0)
+
+
+def solo8_world(rig: Rig) -> solo8.Solo8:
+    """Put a Solo-8's electronics and our driver's link to it into a rig."""
+    rig.electronics = MasterBoard(rig.plant)
+    torque = np.array(rig.policy.metadata.torque_limit)
+    return solo8.Solo8(rig.electronics.wire, rig.electronics.zero, torque, rig.profile.damping)
+
+
+WORLDS = {"go1": go1_world, "solo8": solo8_world}
+
+
+def calibrate_hung_up(rig: Rig) -> None:
+    """Let a Solo-8 search its zeros with its legs in the air, and put it down."""
+    rig.plant.data.qpos[2] += 0.4
+    rig.plant.model.opt.gravity[2] = 0.0
+    rig.run(0.8)
+    rig.press(Request.ACKNOWLEDGE)
+    rig.run_until(State.CALIBRATED)
+    rig.plant.data.qpos[2] -= 0.36
+    rig.plant.data.qvel[:] = 0.0
+    rig.plant.model.opt.gravity[2] = -9.81
 
 
 def _euler(quat: np.ndarray) -> tuple[float, float, float]:

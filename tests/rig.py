@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable
 from pathlib import Path
 
@@ -56,6 +57,8 @@ class Rig:
         self.wish = np.zeros((), WISH)
         self.wish["connected"] = self.wish["held"] = 1
         self.now, self.stopped, self.silent = START, False, False
+        self.order_delay = self.jump = 0  # ns
+        self._late: deque[tuple[int, np.ndarray]] = deque()
         self._tick = 0
         self.modes: list[Mode] = []
         self.speed = self.torque = 0.0
@@ -67,6 +70,8 @@ class Rig:
             if self._tick % each == 0:
                 self._hand()
                 self._run_runtime()
+            while self._late and self._late[0][0] <= self.now:
+                self.channel.orders.put(self._late.popleft()[1])
             if self.electronics is not None:
                 self.electronics.step(self.now)
             self.driver.tick(self.now)
@@ -74,7 +79,8 @@ class Rig:
             self.speed = max(self.speed, float(np.linalg.norm(self.plant.data.qvel[:3])))
             self.torque = max(self.torque, float(np.abs(self.plant.torque).max()))
             self._tick += 1
-            self.now += period
+            self.now += period + self.jump
+            self.jump = 0
 
     def run_until(self, state: State, most: float = 20.0) -> None:
         for _ in range(round(most / 0.02)):
@@ -118,4 +124,5 @@ class Rig:
         if self.stopped:
             return
         reading, wish = self.channel.readings.get(), self.channel.wishes.get()
-        self.channel.orders.put(self.runtime.tick(reading, wish, self.now))
+        order = self.runtime.tick(reading, wish, self.now)
+        self._late.append((self.now + self.order_delay, order))

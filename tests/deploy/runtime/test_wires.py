@@ -7,7 +7,7 @@ import struct
 
 import numpy as np
 import pytest
-from electronics import Go1Electronics, MasterBoard
+from electronics import WORLDS, calibrate_hung_up
 from rig import Rig
 
 from kiras_rl.deploy.runtime import go1, solo8
@@ -69,17 +69,10 @@ def test_a_damaged_state_is_not_read():
 
 @pytest.fixture
 def go1_rig(tmp_path):
-    made = []
-
-    def world(rig):
-        rig.electronics = Go1Electronics(rig.plant)
-        link = go1.Go1(f"127.0.0.1:{rig.electronics.port}", 12, rig.profile.damping, 0)
-        made.extend([link, rig.electronics])
-        return link
-
-    yield Rig("go1", tmp_path, world=world)
-    for end in made:
-        end.close()
+    rig = Rig("go1", tmp_path, world=WORLDS["go1"])
+    yield rig
+    rig.link.close()
+    rig.electronics.close()
 
 
 def test_go1_walks_through_its_wire_and_lies_down(go1_rig):
@@ -161,32 +154,10 @@ def test_a_frame_is_what_the_sdk_sends():
 
 @pytest.fixture
 def solo8_rig(tmp_path):
-    made = []
-
-    def world(rig):
-        rig.electronics = MasterBoard(rig.plant)
-        torque = np.array(rig.policy.metadata.torque_limit)
-        link = solo8.Solo8(rig.electronics.wire, rig.electronics.zero, torque, rig.profile.damping)
-        made.append(rig.electronics)
-        return link
-
-    rig = Rig("solo8", tmp_path, world=world)
+    rig = Rig("solo8", tmp_path, world=WORLDS["solo8"])
     calibrate_hung_up(rig)
     yield rig
-    for end in made:
-        end.close()
-
-
-def calibrate_hung_up(rig):
-    """Let it search its zeros with its legs in the air, and put it down."""
-    rig.plant.data.qpos[2] += 0.4
-    rig.plant.model.opt.gravity[2] = 0.0
-    rig.run(0.8)
-    rig.press(Request.ACKNOWLEDGE)
-    rig.run_until(State.CALIBRATED)
-    rig.plant.data.qpos[2] -= 0.36
-    rig.plant.data.qvel[:] = 0.0
-    rig.plant.model.opt.gravity[2] = -9.81
+    rig.electronics.close()
 
 
 def test_solo8_finds_its_zeros_rises_and_walks_through_its_wire(solo8_rig):
