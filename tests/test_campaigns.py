@@ -5,11 +5,17 @@ from __future__ import annotations
 import os
 
 import pytest
-from campaigns import disks, kills, mutations
+from campaigns import disks, faults, kills, mutations
 
 
 def test_damaged_files_are_usable_or_refused_in_one_line():
     assert mutations.campaign(range(3)) == []
+
+
+def test_a_robot_that_is_broken_on_purpose_is_held_or_damped_in_time_and_the_log_names_it():
+    rows, broken = faults.campaign(1, ("go1",))
+    assert broken == []
+    assert len(rows) == len(faults.FAULTS)
 
 
 @pytest.mark.slow
