@@ -41,6 +41,7 @@ something was wrong with what was given.
 _RATE = 50.0  # Hz, of the operator
 _GRACE = 10.0  # s that the robot has to lie down and end
 _DEFAULT = "solo8"
+_REFUSED = 2  # exit status of a process that cannot begin
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -179,6 +180,8 @@ class Session:
         finally:
             signal.signal(signal.SIGINT, before)
             self._end()
+        if any(child.returncode == _REFUSED for child in self._children.values()):
+            return _REFUSED  # its line is among the events
         return 1 if self._faults else 0
 
     def _device(self, stack: ExitStack) -> Gamepad | Keyboard | Script:

@@ -92,7 +92,9 @@ class Script:
     def _press(self, hand: Hand, now: int) -> None:
         """Press the step's button, again every WAIT until it has done something."""
         moves = self._state != self._before and self._state != State.POLICY
-        if self._index >= len(self._steps) or moves:
+        if self._state == State.DAMPED:  # what follows was meant for a robot that stands
+            self._steps, self._index = [Step(Request.QUIT)], 0
+        elif self._index >= len(self._steps) or moves:
             return
         step = self._steps[self._index]
         self._pressed = now

@@ -8,7 +8,7 @@ import struct
 import pytest
 
 from kiras_rl.deploy.runtime.hands import Gamepad, Hand, Keyboard, Remote, remote_emergency
-from kiras_rl.deploy.runtime.messages import NANO, Request
+from kiras_rl.deploy.runtime.messages import NANO, Request, State
 from kiras_rl.deploy.runtime.scripts import ScriptError, parse_script
 
 A, B, X, Y, RB, START = 0, 1, 2, 3, 5, 7
@@ -135,6 +135,17 @@ def test_the_remote_of_go1(hand):
     assert hand.wish(2, True)["requests"] == 1
     assert remote_emergency(remote(1 << 9))
     assert not remote_emergency(remote(1 << 8))
+
+
+def test_a_script_ends_when_the_robot_is_damped(hand, metadata):
+    script = parse_script("on,stand,walk:600", metadata)
+    script.follow(State.CONNECTED)
+    for second in range(1, 4):
+        script.poll(hand, second * NANO)
+    script.follow(State.DAMPED)
+    for second in range(4, 8):
+        script.poll(hand, 2 * second * NANO)
+    assert hand.wish(1, True)["request"] == Request.QUIT
 
 
 @pytest.mark.parametrize("text", ["", "fly", "walk:x", "walk:1:2:3:4:5"])
