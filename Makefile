@@ -29,13 +29,14 @@ lint: .venv/.installed-dev  ## check style and format
 
 # Type checkers do not follow the package map of an editable install, so a plain copy is checked:
 # what it calls kiras_rl/envs/x.py is envs/x.py here. MuJoCo 4.0 comes without stubs for its
-# compiled modules: the one-line stub says that `mujoco` holds more than its Python source shows.
-types: .venv/.installed-dev  ## check the types (not clean yet, and no gate)
-	rm -rf .venv/typed
+# compiled modules: the one-line stubs say that a package holds more than its Python source shows.
+types: .venv/.installed-dev  ## check the types
+	rm -rf .venv/typed build/lib
 	.venv/bin/python -m pip install -q --no-deps --target .venv/typed .
 	cp pyproject.toml .venv/typed
-	mkdir -p .venv/typed/typings/mujoco
-	echo 'def __getattr__(name: str): ...' > .venv/typed/typings/mujoco/__init__.pyi
+	mkdir -p .venv/typed/typings/mujoco/studio
+	echo 'def __getattr__(name: str): ...' | \
+	    tee .venv/typed/typings/mujoco/__init__.pyi >.venv/typed/typings/mujoco/studio/__init__.pyi
 	cd .venv/typed && ../bin/pyright --pythonpath ../bin/python kiras_rl
 
 clean:  ## remove the environment and build outputs, never runs/

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import difflib
 import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 from kiras_rl.config import ConfigError
 
 
-def find_function(module: dict, name: str, first: type, where: str) -> Callable:
+def find_function(module: Mapping[str, object], name: str, first: type, where: str) -> Callable:
     """Return the public function `name` of a module whose first argument is of type `first`.
 
     Args:

@@ -40,8 +40,7 @@ class Postures:
         self._limits = Limits.of(robot, device)
         self._keyframes, self._kinematics, self._ground = keyframes, kinematics, ground
         self._config = config
-        parts = (robot.foot_geoms, robot.base_geoms, robot.penalised_geoms)
-        self._geoms = tuple(len(part) for part in parts)
+        self._geoms = len(robot.foot_geoms), len(robot.base_geoms), len(robot.penalised_geoms)
 
     def asked(self, action: torch.Tensor) -> torch.Tensor:
         """Return what actions (N, J) ask of the joints, (N, J), rad."""

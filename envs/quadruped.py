@@ -46,6 +46,8 @@ KEYFRAME_COMMANDS = (0.0, 0.4, 0.8)  # of the largest v_x, for the value of a sk
 class QuadrupedEnv(SkillEnv):
     """See SkillEnv for the interface and `step` for the order of one control step."""
 
+    cfg: EnvConfig
+
     def __init__(
         self,
         cfg: EnvConfig,
@@ -301,11 +303,11 @@ class QuadrupedEnv(SkillEnv):
         """Put the masked worlds into the keyframes `start`, (N,), with new physics and ground."""
         self._randomizer.reset(mask)
         self._sensors.reset(mask, self._randomizer.randomized)
-        if self._curriculum:
+        if self._curriculum and self._ground:
             self._curriculum.begin(mask, self.task.skill)
-            self._write_terrain(
-                mask, self._curriculum.tiles() if self._placed is None else self._placed
-            )
+            tile = self._curriculum.tiles() if self._placed is None else self._placed
+            self._ground.write(mask, tile)
+            self.sim.write_terrain(mask, tile)
         qpos, qvel = self._postures.draw_begin(start, self._random)
         joint_pos = qpos[:, 7:]
         self.sim.write_state(mask, qpos, qvel, joint_pos)
@@ -315,10 +317,6 @@ class QuadrupedEnv(SkillEnv):
         self._last_joint_torque = self._last_joint_torque.masked_fill(mask[:, None], 0.0)
         self._memory.forget(mask)
         self._length = self._length.masked_fill(mask, 0)
-
-    def _write_terrain(self, mask: torch.Tensor, tile: torch.Tensor) -> None:
-        self._ground.write(mask, tile)
-        self.sim.write_terrain(mask, tile)
 
     # --- observations -------------------------------------------------------------------------
 
@@ -392,7 +390,13 @@ class QuadrupedEnv(SkillEnv):
     def place(
         self, terrain: torch.Tensor, level: torch.Tensor, variant: torch.Tensor | None = None
     ) -> None:
-        """Choose the ground of every world; variants are dealt in turn where none is given."""
+        """Choose the ground of every world; variants are dealt in turn where none is given.
+
+        Raises:
+            ValueError: All ground is flat.
+        """
+        if self._library is None:
+            raise ValueError("env.terrain=null: all ground is flat, there is none to choose")
         if variant is None:
             variant = torch.arange(self.num_envs, device=self.device) % self._library.variants
         self._placed = self._library.index(terrain, level, variant)
@@ -416,7 +420,13 @@ class QuadrupedEnv(SkillEnv):
             tensor.fill_(share)  # in place: a graph reads it
 
     def measure(self) -> Measurements:
-        """Return the measurements of the last step, before its resets."""
+        """Return the measurements of the last step, before its resets.
+
+        Raises:
+            RuntimeError: No step was made yet.
+        """
+        if self._measurements is None:
+            raise RuntimeError("nothing is measured before the first step")
         return replace(self._measurements, **copied(vars(self._measurements)))
 
     def foot_pos_b(self, joint_pos: torch.Tensor) -> torch.Tensor:
@@ -477,7 +487,7 @@ class QuadrupedEnv(SkillEnv):
         self._memory.load_state_dict(state["memory"])
         self._sensors.load_state_dict(state["sensors"])
         self._observer.load_state_dict(state["observer"])
-        if self._curriculum:
+        if self._curriculum and self._ground:
             self._curriculum.load_state_dict(state["curriculum"])
             self._ground.write(self._all, state["tile"].to(self.device))
         self.robot.read_kinematics()

@@ -85,7 +85,7 @@ class Randomizer:
         """Draw the physics of the masked worlds, (N,) bool."""
         config = self._config
         if config.friction:
-            self._write_friction(mask)
+            self._write_friction(mask, config.friction)
         if self._bodies:
             number = scale_to(self._random["body"], 0.0, BODIES).long()
             number = torch.where(self.randomized, number, BODIES).squeeze(1)
@@ -113,8 +113,8 @@ class Randomizer:
         drawn = scale_to(self._random[name], *getattr(self._config, name))
         return torch.where(self.randomized, drawn, 1.0)
 
-    def _write_friction(self, mask: torch.Tensor) -> None:
-        friction = scale_to(self._random["friction"], *self._config.friction)
+    def _write_friction(self, mask: torch.Tensor, limits: tuple[float, float]) -> None:
+        friction = scale_to(self._random["friction"], *limits)
         # (N, 1) on every geom of the robot; by a mask: a list of them would be copied to the GPU
         slides = self._slides & self.randomized[..., None]
         values = torch.where(slides, friction[..., None], self._friction)

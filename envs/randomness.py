@@ -44,6 +44,6 @@ class UniformBuffer:
         return self._values[:, self._slices[name]]
 
 
-def scale_to(uniform: torch.Tensor, low: float, high: float) -> torch.Tensor:
+def scale_to(uniform: torch.Tensor, low: float, high: float | torch.Tensor) -> torch.Tensor:
     """Map numbers in [0, 1) to [low, high)."""
     return low + (high - low) * uniform

@@ -7,9 +7,10 @@ import zlib
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TypeVar
+from typing import Any, TypeVar, overload
 
 import numpy as np
+import torch
 
 from kiras_rl.config import ConfigError
 from kiras_rl.envs import terrains
@@ -28,7 +29,7 @@ _PARKED_SIZE = (0.1, 0.1, 0.1)  # m
 PARKED = (0.0, 0.0, -50.0)
 """Where geoms lie that a tile does not need, m."""
 
-Index = TypeVar("Index")  # int, or an integer array or tensor
+Index = TypeVar("Index", np.ndarray, torch.Tensor)  # of integers
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,7 +70,13 @@ class TerrainLibrary:
         """Number of tiles, M."""
         return len(self.grid)
 
-    def index(self, kind: Index, level: Index, variant: Index) -> Index:
+    @overload
+    def index(self, kind: int, level: int, variant: int) -> int: ...
+
+    @overload
+    def index(self, kind: Index | int, level: Index | int, variant: Index | int) -> Index: ...
+
+    def index(self, kind: Any, level: Any, variant: Any) -> Any:
         """Return the numbers of tiles from the numbers of their type, level and variant."""
         return (kind * self.levels + level) * self.variants + variant
 

@@ -50,7 +50,8 @@ def save_checkpoint(path: Path, content: dict) -> None:
     with replacing(path) as temporary, temporary.open("wb", buffering=0) as file:
         checked = CheckedFile(file)
         try:
-            torch.save({"format": FORMAT, "versions": versions()} | content, checked)
+            whole = {"format": FORMAT, "versions": versions()} | content
+            torch.save(whole, checked)  # pyright: ignore[reportArgumentType], it writes and flushes
             checked.check(temporary)
         except (OSError, RuntimeError) as error:  # torch hides why its file did not take more
             raise OSError(f"{path} was not written: {_why(error)}") from None

@@ -151,7 +151,10 @@ def _base() -> DictConfig:
 
 
 def _resolve(
-    layers: list[dict], overrides: list[str], source: str, begin: DictConfig | None = None
+    layers: Iterable[dict | DictConfig],
+    overrides: list[str],
+    source: str,
+    begin: DictConfig | None = None,
 ) -> Config:
     """Put layers and overrides on top of `begin`, by default on nothing."""
     config = copy.deepcopy(_schema() if begin is None else begin)
@@ -195,9 +198,11 @@ def _merge(config: DictConfig, layer: dict | DictConfig, source: str) -> DictCon
     layer = OmegaConf.create(layer)
     _check_keys(config, layer, source)
     try:
-        return OmegaConf.unsafe_merge(config, layer)
+        merged = OmegaConf.unsafe_merge(config, layer)
     except OmegaConfBaseException as error:
         raise ConfigError(_explain(error, source)) from None
+    assert isinstance(merged, DictConfig)
+    return merged
 
 
 def _check_keys(config: DictConfig, layer: DictConfig, source: str, prefix: str = "") -> None:

@@ -178,7 +178,10 @@ def load_dataset(path: str | Path) -> Dataset:
     return Dataset(
         **header,
         values={name: arrays[name] for name in features},
-        **{name: arrays[name] for name in LABELS},
+        episode=arrays["episode"],
+        skill=arrays["skill"],
+        done=arrays["done"],
+        fallen=arrays["fallen"],
     )
 
 
@@ -202,8 +205,9 @@ def save_dataset(dataset: Dataset, path: str | Path, formats: Sequence[str] = ("
     try:
         _write_header(dataset, temporary / HEADER)
         if "npz" in formats:
-            labels = {name: getattr(dataset, name) for name in LABELS}
-            np.savez_compressed(temporary / ARRAYS, **labels, **dataset.values)
+            arrays: dict[str, Any] = {name: getattr(dataset, name) for name in LABELS}
+            arrays |= dataset.values
+            np.savez_compressed(temporary / ARRAYS, **arrays)
         if "lerobot" in formats:
             from kiras_rl import lerobot
 

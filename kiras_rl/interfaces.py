@@ -126,6 +126,12 @@ class SkillEnv(VecEnv):
     aliased to a buffer that the next step overwrites.
     """
 
+    device: torch.device
+    """Where the tensors are."""
+
+    max_episode_length: int
+    """Control steps after which an episode is cut."""
+
     skills: tuple[str, ...]
     """Names of the skills, in the order of their one-hot code."""
 
@@ -201,6 +207,9 @@ class SkillEnv(VecEnv):
             terrain: Index into `terrains`, (N,).
             level: Difficulty level, (N,).
             variant: Of the tile, (N,); None deals the variants to the worlds in turn.
+
+        Raises:
+            ValueError: All ground is flat.
         """
 
     @abstractmethod
@@ -236,7 +245,11 @@ class SkillEnv(VecEnv):
 
     @abstractmethod
     def measure(self) -> Measurements:
-        """Return the measurements of the last step."""
+        """Return the measurements of the last step.
+
+        Raises:
+            RuntimeError: No step was made yet.
+        """
 
     @abstractmethod
     def foot_pos_b(self, joint_pos: torch.Tensor) -> torch.Tensor:

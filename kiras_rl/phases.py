@@ -7,7 +7,7 @@ configuration. What a phase does not use is not there, and so costs nothing.
 from __future__ import annotations
 
 from kiras_rl.config import ConfigError, config_from_layers, config_to_dict
-from kiras_rl.schema import Config
+from kiras_rl.schema import Config, TerrainConfig
 
 SKILL_LEARNING, FINETUNING = "skill_learning", "finetuning"
 
@@ -47,6 +47,20 @@ def phase_config(config: Config, phase: str) -> Config:
     except ConfigError as error:
         where = "" if str(error).startswith("finetuning") else "finetuning: "
         raise ConfigError(f"{where}{error}") from None
+
+
+def finetuning_terrain(config: Config) -> TerrainConfig:
+    """Return the terrain of a run's finetuning.
+
+    Raises:
+        ConfigError: There is none, or as `phase_config`.
+    """
+    terrain = phase_config(config, FINETUNING).env.terrain
+    if terrain is None:
+        raise ConfigError(
+            "finetuning.env.terrain=null: finetuning needs terrain, or set finetuning=null"
+        )
+    return terrain
 
 
 def total_iterations(config: Config) -> int:

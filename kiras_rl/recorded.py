@@ -12,7 +12,7 @@ import gc
 import logging
 from collections.abc import Callable, Hashable, Iterable
 from operator import attrgetter
-from typing import TypeVar
+from typing import Any, Generic, TypeVar
 
 import torch
 from torch.utils._pytree import tree_flatten, tree_unflatten
@@ -22,7 +22,7 @@ _log = logging.getLogger(__name__)
 T = TypeVar("T")
 Slot = tuple[object, str]  # an attribute: its owner, and its name with dots
 
-COMPILER = {"unroll_reductions_threshold": 33}
+COMPILER: dict[str, Any] = {"unroll_reductions_threshold": 33}
 """Options of torch.compile. Sums over joints, feet and reward terms become additions in a row: the
 kernels with a dimension of 8 to reduce, which it would write, crash Triton 3.6 (operand does not
 dominate its use, in `tritongpu-remove-layout-conversions`)."""
@@ -30,7 +30,7 @@ dominate its use, in `tritongpu-remove-layout-conversions`)."""
 WARM_UP = 2  # calls before the recording: libraries and optimizers allocate at their first
 
 
-class Recorded:
+class Recorded(Generic[T]):
     """Calls a function; on CUDA records it after a few calls and replays it from then on."""
 
     def __init__(
@@ -65,7 +65,7 @@ class Recorded:
                 function, fullgraph=True, dynamic=False, options=COMPILER
             )
         self._slots: list[tuple[Slot, torch.Tensor]] = []
-        self._recording: _Recording | None = None
+        self._recording: _Recording[T] | None = None
         self._of: Hashable = None  # of no variant
         self._calls = 0
 
@@ -103,12 +103,12 @@ class Recorded:
         self._of = None
 
 
-class _Recording:
+class _Recording(Generic[T]):
     """A graph, the tensors that it reads and replaces, and those that it returns."""
 
     def __init__(
         self,
-        function: Callable[[], tuple],
+        function: Callable[[], T],
         slots: list[tuple[Slot, torch.Tensor]],
         renewed: tuple[object, ...],
     ) -> None:
@@ -119,7 +119,7 @@ class _Recording:
             _bind(slots)
         self._after = [(owner, dict(vars(owner))) for owner in renewed]
 
-    def replay(self) -> tuple:
+    def replay(self) -> T:
         self._graph.replay()
         for owner, attributes in self._after:
             vars(owner).update(attributes)
@@ -175,4 +175,6 @@ def _copies(tensors: list[torch.Tensor]) -> list[torch.Tensor]:
 def _copy_all(targets: list[torch.Tensor], values: list[torch.Tensor]) -> None:
     for dtype in {value.dtype for value in values}:
         group = [i for i, value in enumerate(values) if value.dtype == dtype]
-        torch._foreach_copy_([targets[i] for i in group], [values[i] for i in group])
+        torch._foreach_copy_(  # pyright: ignore[reportPrivateImportUsage], no other takes lists
+            [targets[i] for i in group], [values[i] for i in group]
+        )

@@ -48,6 +48,8 @@ def cover_all_skills(probabilities: torch.Tensor, practised: torch.Tensor) -> to
 class SkillSampler(Part):
     """The probabilities with which the environment draws skills, renewed once an iteration."""
 
+    probabilities: torch.Tensor
+
     def __init__(self, config: SkillInitConfig, num_skills: int, device: str) -> None:
         """Begin uniform.
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 import torch
 from rsl_rl.storage import RolloutStorage
@@ -47,7 +47,9 @@ def check_rollout(
     _agree(fault, "Worlds that diverge are reset before this, so look at your own terms")
 
 
-def _broken_terms(obs: TensorDict, log: dict[str, float], name: NameTerm) -> list[str]:
+def _broken_terms(
+    obs: Mapping[str, torch.Tensor], log: dict[str, float], name: NameTerm
+) -> list[str]:
     terms = [k for k, v in log.items() if k.startswith("Reward/") and not math.isfinite(v)]
     for group, values in obs.items():
         columns = (~torch.isfinite(values)).reshape(len(values), -1).any(dim=0).nonzero().flatten()

@@ -127,7 +127,7 @@ def _tree(mjcf: _Mjcf) -> Iterator[str]:
     for index in range(1, model.nbody):
         if model.body_rootid[index] != base:
             yield f"body {mjcf.body(index)!r} must hang on {mjcf.body(base)!r}, the base"
-    for index in np.flatnonzero(model.geom_bodyid == 0):
+    for index in np.flatnonzero(model.geom_bodyid == 0).tolist():
         yield f"{mjcf.geom(index)} lies in the world, whose ground is the scene's: remove it"
 
 
@@ -169,7 +169,7 @@ def _visuals(mjcf: _Mjcf) -> Iterator[str]:
     without = compile_spec(bare, mjcf.path)
     same = np.isclose(mjcf.model.body_mass, without.body_mass, rtol=1e-6)
     same &= np.isclose(mjcf.model.body_inertia, without.body_inertia, rtol=1e-6).all(axis=1)
-    for index in np.flatnonzero(~same):
+    for index in np.flatnonzero(~same).tolist():
         yield (
             f"body {mjcf.body(index)!r} is heavier with its geoms of group {VISUAL_GROUP}, which "
             'training leaves out: give them mass="0"'

@@ -194,8 +194,9 @@ def bench(args: argparse.Namespace) -> None:
         shown = PARTS[name].table(report[name])
         _print(shown, console)
         tables += shown
-        if args.out is not None:
-            _save(args.out, report, tables)
+        if args.out is None:
+            continue
+        _save(args.out, report, tables)
         if args.plot and hasattr(PARTS[name], "plot"):
             with matplotlib.rc_context(STYLE):
                 save_figure(PARTS[name].plot(report[name]), args.out / f"{name}.png", WRITER)

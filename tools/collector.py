@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from tensordict import TensorDict
 
 from kiras_rl.dataset import Dataset, DatasetError, Feature
 from kiras_rl.envs.observations import UNITS
@@ -109,7 +110,7 @@ def describe_features(env: QuadrupedEnv) -> dict[str, Feature]:
     }
 
 
-def _begin(env: QuadrupedEnv, plan: Plan, skill: torch.Tensor) -> torch.Tensor:
+def _begin(env: QuadrupedEnv, plan: Plan, skill: torch.Tensor) -> TensorDict:
     """Reset every world into its episode; return the first observation."""
     low, high = np.array(plan.command).T
     drawn = np.random.default_rng(plan.seed).uniform(low, high, (plan.num_envs, 3))

@@ -168,7 +168,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 def options_of(args: argparse.Namespace) -> Options:
     """Return the options that `add_options` parsed."""
     given = {name: getattr(args, name) for name in Options.__dataclass_fields__}
-    return Options(**given | {"device": resolve_device(args.device)})
+    given["device"] = resolve_device(args.device)
+    return Options(**given)
 
 
 def _parse(argv: list[str] | None) -> argparse.Namespace:

@@ -21,7 +21,7 @@ from kiras_rl.evaluation.terrain import (
     rough_types,
 )
 from kiras_rl.interfaces import HISTORY, PROPRIO
-from kiras_rl.phases import FINETUNING, phase_config
+from kiras_rl.phases import FINETUNING, finetuning_terrain, phase_config
 from kiras_rl.robots.robot import Robot, load_robot
 from kiras_rl.runner import Evaluators
 from kiras_rl.schema import Config
@@ -123,7 +123,7 @@ def _make_flat_evaluator(config: Config, device: str) -> Callable[[Policy], dict
 def _make_terrain_evaluator(config: Config, device: str) -> Callable[[Policy], TerrainResult]:
     settings = config.evaluation.terrain
     rough = phase_config(config, FINETUNING)
-    count = len(rough_types(build_library(rough.env.terrain).types))
+    count = len(rough_types(build_library(finetuning_terrain(config)).types))
     num_envs = settings.robots * count * len(load_robot(config.robot).skills)
     env = make_evaluation_env(rough, num_envs, TIME_LIMIT, device)
 
@@ -139,11 +139,7 @@ def check_terrain(config: Config) -> None:
     Raises:
         ConfigError: If it cannot be, or has no such level as the evaluation asks for.
     """
-    terrain, level = phase_config(config, FINETUNING).env.terrain, config.evaluation.terrain.level
-    if terrain is None:
-        raise ConfigError(
-            "finetuning.env.terrain=null: finetuning needs terrain, or set finetuning=null"
-        )
+    terrain, level = finetuning_terrain(config), config.evaluation.terrain.level
     build_library(terrain)
     if not 0 <= level < terrain.levels:
         raise ConfigError(

@@ -98,8 +98,8 @@ def save_strips(trace: Trace, model: mujoco.MjModel, tallest: float, path: Path)
     rows = [_strip(trace, skill) for skill in dict.fromkeys(trace.skill.tolist())]
     width, height = np.array(_FRAME_SIZE) / _DPI
     size = (FRAMES * (width + 0.02) + 0.4, len(rows) * (height + 0.17))
-    figure = Figure(figsize=size, layout="constrained")
-    figure.get_layout_engine().set(w_pad=0.01, h_pad=0.01, wspace=0, hspace=0)
+    figure = Figure(figsize=size)
+    figure.set_layout_engine("constrained", w_pad=0.01, h_pad=0.01, wspace=0, hspace=0)
     axes = figure.subplots(len(rows), FRAMES, squeeze=False)
     ground = _ground(trace)
     with Film(model, _FRAME_SIZE, tallest) as film:

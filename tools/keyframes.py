@@ -28,6 +28,7 @@ WRITER = "kiras-keyframes"
 TILE = (420, 340)
 """Width and height of one pose in pixels."""
 
+_ABOUT = "Show a robot's keyframes: a table of what each asks of the robot, and one picture."
 _COLUMNS = 5
 _DPI = 100
 _TITLE = 55
@@ -36,7 +37,7 @@ _TITLE = 55
 
 def main(argv: list[str] | None = None) -> int:
     """Run the command; returns 0, or 2 after an error."""
-    parser = argparse.ArgumentParser(prog="kiras-keyframes", description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(prog="kiras-keyframes", description=_ABOUT)
     parser.add_argument("robot", help="a folder of robots/, e.g. solo8")
     parser.add_argument(
         "--out", type=file_of(PICTURES), help="picture (default: runs/keyframes/ROBOT.png)"

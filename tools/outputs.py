@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import zipfile
 from pathlib import Path
-from typing import NoReturn
+from typing import Any, NoReturn
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -49,7 +49,7 @@ def refuse(path: Path) -> NoReturn:
     )
 
 
-def save_figure(figure: Figure, path: Path, writer: str, **options: object) -> None:
+def save_figure(figure: Figure, path: Path, writer: str, **options: Any) -> None:
     """Write a figure, whole or not at all; the ending of the path decides the format.
 
     Args:
@@ -78,9 +78,10 @@ def save_arrays(arrays: dict[str, np.ndarray], path: Path, writer: str) -> None:
         OutputError: As `check_output`.
     """
     check_output(path, writer)
+    named: dict[str, Any] = {**arrays}  # numpy's types take each for an option, too
     with replacing(path) as temporary:
         with temporary.open("wb") as file:
-            np.savez_compressed(file, **arrays)
+            np.savez_compressed(file, **named)
         with zipfile.ZipFile(temporary, "a") as archive:
             archive.comment = writer.encode()
 

@@ -11,6 +11,7 @@ from rich.console import Console
 from rich.live import Live
 from rich.text import Text
 
+from kiras_rl.evaluation.flat import SkillResult
 from kiras_rl.evaluation.terrain import TerrainResult
 from kiras_rl.status import Status
 
@@ -74,7 +75,7 @@ class Progress:
         return " | ".join(parts)
 
 
-def _brief(result: object) -> str:
+def _brief(result: SkillResult) -> str:
     height, pitch = 100 * result.height, math.degrees(result.pitch)
     return f"{height:.0f},{pitch:+.0f},{result.velocity:.2f}"
 

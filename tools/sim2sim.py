@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -249,7 +250,7 @@ def run_trial(simulator: Simulator, policy: OnboardPolicy, start: Start, duratio
         torques = simulator.asked, simulator.torque
         rows.append((*before, *torques, simulator.foot_force, simulator.foot_height))
     arrays = map(np.stack, zip(*rows, strict=True))
-    return Record(*arrays, control_steps, simulator.has_fallen)
+    return Record(*arrays, control_steps=control_steps, has_fallen=simulator.has_fallen)
 
 
 @dataclass(frozen=True)
@@ -325,7 +326,7 @@ def _falls(records: list[Record]) -> float:
     return float(np.mean([record.has_fallen for record in records]))
 
 
-def loads(records: list[Record], robot: Robot, limits: np.ndarray) -> dict[str, object]:
+def loads(records: list[Record], robot: Robot, limits: np.ndarray) -> dict[str, Any]:
     """Return what walks ask of joints and motors; None where there is nothing to count.
 
     Args:

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import torch
 
 from kiras_rl.envs.ground import Ground
 from kiras_rl.envs.model import build_scene
-from kiras_rl.envs.simulation.base import Simulation
 from kiras_rl.envs.terrain_library import TerrainLibrary
 from kiras_rl.robots.robot import Robot
 from kiras_rl.schema import SimConfig
+
+if TYPE_CHECKING:
+    from kiras_rl.envs.simulation.warp import WarpSimulation
 
 _WORLDS = 64
 _EPISODES = 4
@@ -49,7 +53,7 @@ def measure_budgets(
 
 
 def _measure(
-    sim: Simulation,
+    sim: WarpSimulation,
     ground: Ground,
     robot: Robot,
     library: TerrainLibrary,

@@ -36,6 +36,7 @@ TILE = (300, 200)
 _SUN = (0.75, -0.35, -0.56)
 """Direction of the light: flat enough that bumps throw shadows."""
 
+_ABOUT = "Show a robot's terrain: one picture of all types and levels."
 _DPI = 100
 _MARGIN = (150, 40)
 """Pixels left of the tiles for the types, and above them for the levels."""
@@ -43,7 +44,7 @@ _MARGIN = (150, 40)
 
 def main(argv: list[str] | None = None) -> int:
     """Run the command; returns 0, or 2 after an error."""
-    parser = argparse.ArgumentParser(prog="kiras-terrains", description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(prog="kiras-terrains", description=_ABOUT)
     parser.add_argument("robot", help="a folder of robots/, e.g. solo8")
     parser.add_argument("--cfg", default="base", help="configuration with the terrain")
     parser.add_argument(
@@ -151,14 +152,15 @@ def _rows(library: TerrainLibrary) -> list[tuple[str, list[int]]]:
 def _render(robot: Robot, library: TerrainLibrary, tiles: set[int]) -> dict[int, np.ndarray]:
     """Return a picture of each tile, of shape (height, width, 3)."""
     scene = build_scene(robot, 0.005, 10, library=library, visuals=True)
-    model, pictures = scene.model, {}
+    model, pictures, ground = scene.model, {}, scene.terrain
+    assert ground is not None
     model.stat.extent = 3.0  # m: shadows and clipping planes reach as far as the picture
     model.light("sun").dir[:] = _SUN
     model.light("sun").diffuse[:] = 0.85
     data = mujoco.MjData(model)
     with make_renderer(model, *TILE) as renderer:
         for tile in tiles:
-            scene.terrain.show(model, data, tile)
+            ground.show(model, data, tile)
             data.qpos[:] = robot.keyframes[0].qpos
             data.qpos[2] += library.spawn_height[tile]
             mujoco.mj_forward(model, data)

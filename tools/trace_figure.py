@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import matplotlib
 import numpy as np
@@ -16,8 +17,15 @@ from kiras_rl.deploy.policy import PolicyMetadata
 from kiras_rl.tools.outputs import save_figure
 from kiras_rl.tools.script import Trace
 
+if TYPE_CHECKING:
+    from matplotlib.typing import RcKeyType
+
 WRITER = "kiras-play --trace"
-_STYLE = {"font.size": 9, "axes.spines.top": False, "axes.spines.right": False}
+_STYLE: dict[RcKeyType, Any] = {
+    "font.size": 9,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+}
 _MEASURED = "#1f4e79"
 _TARGET = "#d1570a"
 _FALL = "#c00000"

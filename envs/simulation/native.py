@@ -72,17 +72,17 @@ class NativeSimulation:
         self._fresh_history = fresh.reshape(self.model.nu, -1).copy()
 
     def _bind_terrain(self, terrain: TerrainGeoms | None) -> None:
-        self._terrain = terrain
         self._tile = np.zeros(self.num_worlds, dtype=np.int64)
-        self._terrain_fields = {}
+        self._terrain_tables: list[tuple[np.ndarray, np.ndarray]] = []
         if terrain is not None:
             for name in TERRAIN_FIELDS:
-                self._terrain_fields[name] = self._batch.expand(name)[:, terrain.geoms]
+                field = self._batch.expand(name)[:, terrain.geoms]
+                self._terrain_tables.append((field, terrain.fields[name]))
             self._show_tiles(slice(None))
 
     def _show_tiles(self, rows: np.ndarray | slice) -> None:
-        for name, field in self._terrain_fields.items():
-            field[rows] = self._terrain.fields[name][self._tile[rows]]
+        for field, table in self._terrain_tables:
+            field[rows] = table[self._tile[rows]]
 
     def _allocate_outputs(self) -> None:
         n, model = self.num_worlds, self.model
@@ -125,13 +125,13 @@ class NativeSimulation:
         self._warmstart[rows] = 0.0
         self._time[rows] = 0.0
         if self._history is not None:
-            self._fill_history(rows, ctrl[ids].numpy())
+            self._fill_history(self._history, rows, ctrl[ids].numpy())
         self.qpos[ids], self.qvel[ids] = qpos[ids], qvel[ids]
 
-    def _fill_history(self, rows: np.ndarray, ctrl: np.ndarray) -> None:
+    def _fill_history(self, history: np.ndarray, rows: np.ndarray, ctrl: np.ndarray) -> None:
         # One buffer an actuator: [two cursors, n times, n values] (mjData.history).
         n = self._history_samples
-        buffers = self._history.reshape(self.num_worlds, self.model.nu, 2 + 2 * n)
+        buffers = history.reshape(self.num_worlds, self.model.nu, 2 + 2 * n)
         buffers[rows] = self._fresh_history
         buffers[rows, :, 2 + n :] = ctrl[:, :, None]
 
@@ -162,7 +162,7 @@ class NativeSimulation:
     def load_state_dict(self, state: dict[str, torch.Tensor]) -> None:
         """Go on from a saved state."""
         self._tile[:] = state["tile"].numpy()
-        if self._terrain is not None:
+        if self._terrain_tables:
             self._show_tiles(slice(None))
             self._batch.set_const()
         for name, field in self._fields.items():  # last: set_const would round them otherwise

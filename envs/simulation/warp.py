@@ -12,6 +12,7 @@ import functools
 import gc
 import logging
 from collections.abc import Callable, Iterator
+from typing import no_type_check
 
 import mujoco
 import mujoco_warp as mjw
@@ -42,6 +43,7 @@ _BUDGETS = {
 
 
 @wp.kernel
+@no_type_check  # the body of a kernel is Warp's language
 def _add_contact_forces(
     force: wp.array[wp.spatial_vector],
     geom: wp.array[wp.vec2i],
@@ -63,6 +65,7 @@ def _add_contact_forces(
 
 
 @wp.kernel
+@no_type_check
 def _read_warnings(
     qpos: wp.array2d[float],
     qvel: wp.array2d[float],
@@ -146,7 +149,7 @@ class WarpSimulation:
     ) -> None:
         n = self.num_worlds
         fields = RANDOMISED_FIELDS + (TERRAIN_FIELDS if terrain else ())
-        sizes = dict.fromkeys(fields, n)
+        sizes: dict[str, int] = dict.fromkeys(fields, n)
         model, columns = _without_contact_sensors(self.model)
         self._m = mjw.put_model(model, batch_sizes=sizes)
         self._m.opt.warn_overflow = 0  # printed by the kernels; counted here instead
@@ -161,7 +164,7 @@ class WarpSimulation:
         self._record = wp.zeros((self._substeps, n, self.model.nsensordata), dtype=float)
         contacts = self._d.naconmax
         self._contact_ids = wp.array(np.arange(contacts, dtype=np.int32))
-        self._contact_force = wp.zeros(contacts, dtype=wp.spatial_vector)
+        self._contact_force = wp.array(np.zeros((contacts, 6)), dtype=wp.spatial_vector)
         self._columns = wp.array(columns)
 
     def _bind_state(self) -> None:
@@ -233,8 +236,10 @@ class WarpSimulation:
         data = self._d
         for k in range(self._substeps):
             mjw.step(self._m, data)
-            wp.copy(self._record[k], data.sensordata)
-            self._launch_contact_forces(self._record[k])
+            # Warp's types allow for an indexed array, which only a list of indices makes
+            record: wp.array = self._record[k]  # pyright: ignore[reportAssignmentType]
+            wp.copy(record, data.sensordata)
+            self._launch_contact_forces(record)
         wp.launch(
             _read_warnings,
             dim=self.num_worlds,
@@ -244,7 +249,7 @@ class WarpSimulation:
             ],
         )
 
-    def _launch_contact_forces(self, record: wp.array2d[float]) -> None:
+    def _launch_contact_forces(self, record: wp.array) -> None:
         data, contact = self._d, self._d.contact
         mjw.contact_force(self._m, data, self._contact_ids, True, self._contact_force)
         wp.launch(

@@ -178,7 +178,7 @@ class Estimation(Part):
         """Return the estimator."""
         return self.networks()
 
-    def onboard(self) -> nn.Module:
+    def onboard(self) -> ContextEstimator:
         """Return the estimator."""
         return self.estimator
 

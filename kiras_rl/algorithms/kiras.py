@@ -8,7 +8,6 @@ from itertools import chain
 
 import torch
 from rsl_rl.algorithms import PPO
-from rsl_rl.models import MLPModel
 from tensordict import TensorDict
 from torch import nn
 
@@ -21,6 +20,7 @@ from kiras_rl.algorithms.rollout import Rollout
 from kiras_rl.algorithms.storage import GroupRolloutStorage, mini_batches
 from kiras_rl.algorithms.trainer import Trainer
 from kiras_rl.interfaces import SkillEnv
+from kiras_rl.models.actor import Actor
 from kiras_rl.models.critics import GroupCritic
 from kiras_rl.models.exported import ExportedPolicy
 from kiras_rl.schedules import advantage_weights, piecewise_linear
@@ -39,7 +39,7 @@ class KirasPPO(PPO):
         parts: By name, in the order in which they are asked; see kiras_rl.algorithms.part.
     """
 
-    actor: MLPModel
+    actor: Actor
     critic: GroupCritic
     storage: GroupRolloutStorage
 
@@ -50,7 +50,7 @@ class KirasPPO(PPO):
         ppo = config.ppo
         super().__init__(
             learner.actor,
-            learner.critic,
+            learner.critic,  # pyright: ignore[reportArgumentType], it has what rsl-rl asks for
             learner.storage,
             num_learning_epochs=ppo.num_epochs,
             num_mini_batches=ppo.num_mini_batches,
@@ -147,8 +147,10 @@ class KirasPPO(PPO):
         """Return the rewards of task and parts, (T, N, G); summed where there is one critic."""
         task = self.storage.task_rewards
         task = task.clamp(min=0.0) if self.config.ppo.only_positive_rewards else task
-        groups = [task, *(part.rewards().unsqueeze(-1) for part in self._earning)]
-        return torch.cat(groups, dim=-1) if self.config.multi_critic else sum(groups)
+        others = [part.rewards().unsqueeze(-1) for part in self._earning]
+        if self.config.multi_critic:
+            return torch.cat([task, *others], dim=-1)
+        return sum(others, start=task)
 
     def _weights(self) -> tuple[float, ...]:
         """Return omega_1 of the task's advantages, and omega_2 of those of each part."""

@@ -51,7 +51,7 @@ def retention_loss(
 
 
 def adapt_learning_rate(
-    rate: torch.Tensor, kl: torch.Tensor, desired_kl: float, limits: tuple[float, float]
+    rate: torch.Tensor, kl: torch.Tensor, desired_kl: torch.Tensor, limits: tuple[float, float]
 ) -> torch.Tensor:
     """Return a lower rate where the policy moved too far, a higher one where it hardly moved.
 

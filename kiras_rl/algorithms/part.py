@@ -22,6 +22,7 @@ from kiras_rl.shards import Batch
 
 if TYPE_CHECKING:
     from kiras_rl.algorithms.storage import GroupRolloutStorage
+    from kiras_rl.models.estimator import ContextEstimator
     from kiras_rl.models.exported import ExportedPolicy
 
 
@@ -168,7 +169,7 @@ class Part:
         """Return the networks that go on into the next phase."""
         return {}
 
-    def onboard(self) -> nn.Module | None:
+    def onboard(self) -> ContextEstimator | None:
         """Return the network that the robot needs: history -> velocity, mean, log variance."""
         return None
 

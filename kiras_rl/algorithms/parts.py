@@ -6,10 +6,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
-from rsl_rl.models import MLPModel
 from rsl_rl.utils import resolve_callable
 from tensordict import TensorDict
-from torch import nn
 
 from kiras_rl import interfaces as names
 from kiras_rl.algorithms.estimation import Estimation
@@ -19,6 +17,7 @@ from kiras_rl.algorithms.storage import GroupRolloutStorage
 from kiras_rl.config import ConfigError
 from kiras_rl.imitation.self_imitation import SelfImitation
 from kiras_rl.interfaces import SkillEnv
+from kiras_rl.models.actor import Actor
 from kiras_rl.models.critics import GroupCritic
 from kiras_rl.models.exported import ExportedPolicy
 from kiras_rl.models.precision import uses_bfloat16
@@ -48,7 +47,7 @@ class Learner:
         policy: Actor and what the robot needs beside it, sharing their weights.
     """
 
-    actor: MLPModel
+    actor: Actor
     critic: GroupCritic
     storage: GroupRolloutStorage
     parts: dict[str, Part]
@@ -84,7 +83,8 @@ def build_learner(obs: TensorDict, env: SkillEnv, cfg: dict, device: str) -> Lea
     count = 1 + len(reward_groups(parts)) if config.multi_critic else 1
     steps = config.ppo.num_steps
     storage = GroupRolloutStorage(env.num_envs, steps, count, obs, env.num_actions, device)
-    actor = _build_actor(obs, groups, env.num_actions, config).to(device)
+    dims, std = config.ppo.actor_dims, config.ppo.action_std[0][1]
+    actor = Actor(obs, groups, env.num_actions, list(dims), std).to(device)
     onboard = [network for part in parts.values() if (network := part.onboard())]
     policy = ExportedPolicy(onboard[0] if onboard else None, actor.mlp)
     for part in parts.values():
@@ -119,26 +119,9 @@ def find_part(name: str, class_name: str | None) -> type[Part]:
     """
     where = f"learner.parts.{name}.class_name={class_name}"
     try:
-        found = resolve_callable(class_name)
+        found = resolve_callable(class_name or "")
     except (ImportError, AttributeError, ValueError, TypeError) as error:
         raise ConfigError(f"{where}: give a class as package.module:Class ({error})") from None
     if not (isinstance(found, type) and issubclass(found, Part)):
         raise ConfigError(f"{where}: not a kiras_rl.algorithms.part.Part")
     return found
-
-
-def _build_actor(
-    obs: TensorDict, groups: dict[str, list[str]], num_actions: int, config: LearnerConfig
-) -> MLPModel:
-    distribution = {
-        "class_name": "GaussianDistribution",
-        "init_std": config.ppo.action_std[0][1],
-        "learn_std": False,
-    }
-    actor = MLPModel(
-        obs, groups, "actor", num_actions, list(config.ppo.actor_dims), "elu", False, distribution
-    )
-    # First actions near zero: the robot begins in its default pose, not in a random one.
-    nn.init.normal_(actor.mlp[-1].weight, std=0.01)
-    nn.init.zeros_(actor.mlp[-1].bias)
-    return actor

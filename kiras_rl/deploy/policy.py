@@ -136,11 +136,12 @@ class OnboardPolicy:
             PolicyError: If the policy has no such skill.
         """
         skills = self.metadata.skills
-        if isinstance(skill, str) and skill in skills:
+        if not isinstance(skill, str):
+            with suppress(TypeError):  # what is no whole number
+                if 0 <= operator.index(skill) < len(skills):
+                    return operator.index(skill)
+        elif skill in skills:
             return skills.index(skill)
-        with suppress(TypeError):  # what is no whole number
-            if 0 <= operator.index(skill) < len(skills):
-                return operator.index(skill)
         close = difflib.get_close_matches(str(skill), skills, n=1)
         hint = f" (did you mean '{close[0]}'?)" if close else ""
         raise PolicyError(f"unknown skill '{skill}'{hint}; this policy has: {', '.join(skills)}")
@@ -159,7 +160,8 @@ class OnboardPolicy:
             PolicyError: If the network returns numbers that are not finite.
         """
         inputs = {"proprio": proprio, "history": history}
-        actions, velocity = self._session.run(["actions", "velocity"], inputs)
+        outputs = self._session.run(["actions", "velocity"], inputs)
+        actions, velocity = map(np.asarray, outputs)
         if not np.isfinite(actions).all():
             raise PolicyError("the network returned numbers that are not finite: damaged weights?")
         return actions, velocity
@@ -269,7 +271,8 @@ def _read_metadata(session: onnxruntime.InferenceSession, path: Path) -> PolicyM
 def _check_widths(
     session: onnxruntime.InferenceSession, metadata: PolicyMetadata, path: Path
 ) -> None:
-    given = {port.name: port.shape[-1] for port in session.get_inputs() + session.get_outputs()}
+    ports = (*session.get_inputs(), *session.get_outputs())
+    given = {port.name: port.shape[-1] for port in ports}
     expected = {
         "proprio": metadata.frame_size,
         "history": metadata.history_size,

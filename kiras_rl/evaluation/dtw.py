@@ -36,8 +36,8 @@ def dtw(first: torch.Tensor, second: torch.Tensor) -> float:
         raise ConfigError(
             "dynamic time warping needs one more package: pip install 'kiras-rl[evaluation]'"
         ) from None
-    arrays = (x.double().cpu().contiguous().numpy() for x in (first, second))
-    return dtw_ndim.distance_fast(*arrays, inner_dist="euclidean")
+    one, other = (x.double().cpu().contiguous().numpy() for x in (first, second))
+    return dtw_ndim.distance_fast(one, other, inner_dist="euclidean")
 
 
 def dtw_to_clips(

@@ -137,7 +137,8 @@ def record_motion(env: SkillEnv, policy: Policy, command: float) -> Motion:
         )
         for now, alive in walk(env, policy, (start + STEPS) * env.step_dt, skill, commands)
     ]
-    return Motion(skill, *(torch.stack(x) for x in zip(*steps[start:], strict=True)), env.step_dt)
+    signals = (torch.stack(x) for x in zip(*steps[start:], strict=True))
+    return Motion(skill, *signals, step_dt=env.step_dt)
 
 
 def pose_features(

@@ -33,16 +33,13 @@ class GroupCritic(nn.Module):
             bfloat16: Multiply the hidden layers in it.
         """
         super().__init__()
-        self._bfloat16 = bfloat16
         self.critics = nn.ModuleList(
-            MLPModel(obs, obs_groups, "critic", 1, hidden_dims, "elu") for _ in range(num_groups)
+            _Critic(obs, obs_groups, hidden_dims, bfloat16) for _ in range(num_groups)
         )
 
     def forward(self, obs: TensorDict, **_: object) -> torch.Tensor:
         """Return the values of every group, (N, G)."""
-        return torch.cat(
-            [apply_layers(c.mlp, c.get_latent(obs), self._bfloat16) for c in self.critics], dim=-1
-        )
+        return torch.cat([critic(obs) for critic in self.critics], dim=-1)
 
     def reset(self, dones: torch.Tensor | None = None, hidden_state: object = None) -> None:
         """Do nothing: there is no memory."""
@@ -53,3 +50,20 @@ class GroupCritic(nn.Module):
 
     def update_normalization(self, obs: TensorDict) -> None:
         """Do nothing: observations have fixed scales."""
+
+
+class _Critic(MLPModel):
+    """The value network of one group."""
+
+    def __init__(
+        self,
+        obs: TensorDict,
+        obs_groups: dict[str, list[str]],
+        hidden_dims: list[int],
+        bfloat16: bool,
+    ) -> None:
+        super().__init__(obs, obs_groups, "critic", 1, hidden_dims, "elu")
+        self._bfloat16 = bfloat16
+
+    def forward(self, obs: TensorDict, *_: object) -> torch.Tensor:
+        return apply_layers(self.mlp, self.get_latent(obs), self._bfloat16)

@@ -22,7 +22,7 @@ class ExportedPolicy(nn.Module):
             estimator, to actions (N, J).
     """
 
-    def __init__(self, estimator: nn.Module | None, actor_mlp: nn.Module) -> None:
+    def __init__(self, estimator: ContextEstimator | None, actor_mlp: nn.Module) -> None:
         """Keep both networks; their weights are shared with the caller, not copied."""
         super().__init__()
         self.estimator = estimator

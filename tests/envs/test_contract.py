@@ -95,6 +95,17 @@ def test_measurements_outlive_the_next_step(env):
     assert all(torch.equal(getattr(now, name), value) for name, value in kept.items())
 
 
+def test_nothing_is_measured_before_the_first_step(env):
+    with pytest.raises(RuntimeError, match="before the first step"):
+        env.measure()
+
+
+def test_flat_ground_leaves_no_tile_to_choose(env):
+    of_each = torch.zeros(WORLDS, dtype=torch.int64)
+    with pytest.raises(ValueError, match="all ground is flat"):
+        env.place(of_each, of_each)
+
+
 def test_the_height_of_the_feet_follows_from_what_is_measured(robot, build_env, nominal):
     env = build_env(f"robot={robot.name}", *nominal, num_envs=WORLDS)
     env.step(actions(env))

@@ -209,6 +209,11 @@ def test_contacts_need_a_height_field(capsys):
     assert "height field" in capsys.readouterr().err
 
 
+def test_contacts_need_terrain(capsys):
+    assert main([*SMALL, "--parts=contacts", "finetuning.env.terrain=null"]) == 2
+    assert "finetuning needs terrain" in capsys.readouterr().err
+
+
 def test_options_need_a_policy_that_comes_with_the_robot(capsys, monkeypatch, tmp_path):
     bare = SimpleNamespace(folder=tmp_path)
     monkeypatch.setattr("kiras_rl.tools.policy_files.load_robot", lambda name: bare)

@@ -151,6 +151,16 @@ def test_a_result_holds_for_the_physics_that_it_was_measured_on(tmp_path, monkey
     assert key(7) != standard
 
 
+@pytest.mark.parametrize("protocol", ["terrain", "obstacles", "heat_map"])
+def test_a_robot_without_terrain_of_its_own_has_none_to_cross(
+    protocol, tmp_path, capsys, monkeypatch
+):
+    flat = load_config("solo8", ["finetuning=null"])
+    monkeypatch.setattr("kiras_rl.tools.protocols.subject.standard_config", lambda robot: flat)
+    assert main(["--protocol", protocol, *FEW, "--out", str(tmp_path)]) == 2
+    assert "the standard configuration of solo8 has no terrain" in capsys.readouterr().err
+
+
 def test_what_counts_as_a_fall_is_the_robot_s_standard():
     standard = load_config("solo8")
     trained = load_config("solo8", ["env.terminations.max_tilt=3.0"])

@@ -19,7 +19,7 @@ from kiras_rl.config import ConfigError
 from kiras_rl.envs.model import Scene, build_scene
 from kiras_rl.envs.terrain_library import TerrainLibrary, build_library
 from kiras_rl.envs.terrains import HALF
-from kiras_rl.phases import FINETUNING, phase_config
+from kiras_rl.phases import FINETUNING, finetuning_terrain, phase_config
 from kiras_rl.robots.robot import Robot, load_robot
 from kiras_rl.tools.benchmarks.request import Figures, Request
 from kiras_rl.tools.benchmarks.tables import make_table
@@ -55,13 +55,14 @@ def measure(request: Request) -> Figures:
     """Collide all poses under every setting, in turns.
 
     Raises:
-        ConfigError: No finetuning, or flat tiles alone, which have no height field.
+        ConfigError: No finetuning or no terrain in it, or flat tiles alone, which have no height
+            field.
         RobotError: No such robot.
     """
     if request.config.finetuning is None:
         raise ConfigError("finetuning=null: this configuration has no terrain to measure")
     config = phase_config(request.config, FINETUNING)
-    robot, library = load_robot(config.robot), build_library(config.env.terrain)
+    robot, library = load_robot(config.robot), build_library(finetuning_terrain(request.config))
     if not (library.grid > 0).any():
         raise ConfigError(
             "finetuning.env.terrain.types: none has a height field, which these settings are for; "
@@ -105,11 +106,12 @@ def _collide(
 
     The contacts of a pose are (C, 4).
     """
-    model, data = scene.model, mujoco.MjData(scene.model)
+    model, data, tiles = scene.model, mujoco.MjData(scene.model), scene.terrain
+    assert tiles is not None
     model.opt.ccd_iterations, model.opt.ccd_tolerance = iterations, tolerance
     ground, found, seconds = model.geom("terrain/ground").id, [], 0.0
     for pose in poses:
-        scene.terrain.show(model, data, pose.tile)
+        tiles.show(model, data, pose.tile)
         data.qpos[:] = pose.qpos
         mujoco.mj_kinematics(model, data)
         mujoco.mj_comPos(model, data)

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from statistics import median
+from typing import TYPE_CHECKING
 
-from matplotlib import colormaps
+from matplotlib import color_sequences
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from rich.table import Table
@@ -16,6 +17,9 @@ from kiras_rl.tools.benchmarks.tables import make_table
 from kiras_rl.tools.benchmarks.training import Training
 from kiras_rl.tools.benchmarks.workload import ENVIRONMENT_PARTS
 from kiras_rl.tools.timing import PartTimer, Times
+
+if TYPE_CHECKING:
+    from matplotlib.typing import ColorType
 
 REST = "rest"
 PARTS = (
@@ -102,7 +106,7 @@ def _parts_of(figures: Figures) -> list[str]:
     """Return the parts that any phase has, in their order."""
     present = {part for seconds in figures["seconds"].values() for part in seconds}
     named = (name for *_, part in PARTS for name in (part, FIRST_OF_GRAPH.get(part)))
-    return [part for part in (*named, REST) if part in present]
+    return [part for part in (*named, REST) if part and part in present]
 
 
 def plot(figures: Figures) -> Figure:
@@ -110,7 +114,7 @@ def plot(figures: Figures) -> Figure:
     phases = figures["seconds"]
     figure = Figure(figsize=(11, 1.9 + 0.8 * len(phases)), layout="constrained")
     axes = figure.subplots()
-    colors = dict(zip(_parts_of(figures), colormaps["tab20"].colors, strict=False))
+    colors = dict(zip(_parts_of(figures), color_sequences["tab20"], strict=False))
     longest = max(sum(seconds.values()) for seconds in phases.values())
     for row, seconds in enumerate(phases.values()):
         _stack(axes, row, seconds, colors, least=0.04 * longest)
@@ -127,7 +131,7 @@ def plot(figures: Figures) -> Figure:
 
 
 def _stack(
-    axes: Axes, row: int, seconds: dict[str, float], colors: dict[str, tuple], least: float
+    axes: Axes, row: int, seconds: dict[str, float], colors: dict[str, ColorType], least: float
 ) -> None:
     """Draw a bar; parts of less than `least` seconds have no room for a number."""
     left, whole = 0.0, sum(seconds.values())

@@ -9,17 +9,18 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 from statistics import median
+from typing import TypeVar
 
 import torch
 from rich.table import Table
 from rsl_rl.env import VecEnv
 from rsl_rl.runners import OnPolicyRunner
 from tensordict import TensorDict
-from torch import nn
 
 from kiras_rl import interfaces as names
 from kiras_rl.envs import make_env
 from kiras_rl.envs.quadruped import QuadrupedEnv
+from kiras_rl.models.actor import start_near_zero
 from kiras_rl.process import single_threaded
 from kiras_rl.runner import KirasRunner
 from kiras_rl.schema import Config, LearnerConfig
@@ -27,6 +28,8 @@ from kiras_rl.tools.benchmarks.request import Figures, Request
 from kiras_rl.tools.benchmarks.tables import make_table, verdict, with_range
 from kiras_rl.tools.benchmarks.training import ungated
 from kiras_rl.tools.timing import PartTimer, Times, interleave, ratios, summarise, wait_for
+
+Runner = TypeVar("Runner", bound=OnPolicyRunner)
 
 STOCK, STOCK_SINGLE = "rsl-rl PPO", "rsl-rl PPO, 1-thread rollout"
 KIRAS = "KiRAS"
@@ -146,8 +149,8 @@ class _LearningBench:
     def add(
         self,
         name: str,
-        make: Callable[[], OnPolicyRunner],
-        iterate: Callable[[OnPolicyRunner], object],
+        make: Callable[[], Runner],
+        iterate: Callable[[Runner], object],
     ) -> None:
         """Build a learner on a fresh observation: learners add groups of their own to it."""
         self._restore()
@@ -200,8 +203,7 @@ def _make_stock(env: QuadrupedEnv, config: Config, device: str) -> OnPolicyRunne
     with contextlib.redirect_stdout(io.StringIO()):  # it prints its networks
         runner = OnPolicyRunner(StockView(env), _stock_config(config.learner), None, device)
     # Like the actor of KiRAS, so that the robots move alike and the physics costs the same
-    nn.init.normal_(runner.alg.actor.mlp[-1].weight, std=0.01)
-    nn.init.zeros_(runner.alg.actor.mlp[-1].bias)
+    start_near_zero(runner.alg.actor.mlp)
     return runner
 
 

@@ -9,6 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from statistics import median
 from tempfile import TemporaryFile
+from typing import Any
 
 import torch
 from rich.table import Table
@@ -66,8 +67,11 @@ def _peer(request: Request) -> Iterator[tuple[dict, Callable[[], float]]]:
         except OSError as error:
             raise ConfigError(f"--peer {request.peer}: {error.strerror}") from None
 
-        def answer() -> dict | float:
-            line = process.stdout.readline()
+        questions, answers = process.stdin, process.stdout
+        assert questions is not None and answers is not None
+
+        def answer() -> Any:
+            line = answers.readline()
             if not line:
                 process.wait()
                 messages.seek(0)
@@ -76,15 +80,15 @@ def _peer(request: Request) -> Iterator[tuple[dict, Callable[[], float]]]:
             return json.loads(line)
 
         def step() -> float:
-            process.stdin.write("\n")
-            process.stdin.flush()
+            questions.write("\n")
+            questions.flush()
             return answer() / STEPS
 
         with process:
             try:
                 yield answer(), step
             finally:
-                process.stdin.close()
+                questions.close()
 
 
 def table(figures: Figures) -> list[Table]:

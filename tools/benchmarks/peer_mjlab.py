@@ -33,9 +33,9 @@ def main(device: str, worlds: int, steps: int) -> None:
 
 
 def _build(device: str, worlds: int):  # noqa: ANN202, its types are not installed here
-    import mjlab.tasks  # registers them
+    import mjlab.tasks  # pyright: ignore[reportMissingImports], registers them
     import torch
-    from mjlab.envs import ManagerBasedRlEnv
+    from mjlab.envs import ManagerBasedRlEnv  # pyright: ignore[reportMissingImports]
 
     config = mjlab.tasks.registry.load_env_cfg(TASK)
     config.scene.num_envs = worlds

@@ -59,7 +59,7 @@ def measure(subject: Subject) -> dict:
     results = subject.results(pieces | {on_flat: run})
     cells = {obstacle: pool([results[key] for key in keys]) for obstacle, keys in parts.items()}
     return {
-        "scale": subject.rough().env.terrain.scale,
+        "scale": subject.terrain.scale,
         "headline": {name: cells[obstacle] for name, obstacle in HEADLINE.items()},
         "others": [{"type": o[0], "size": o[1], "cells": cells[o]} for o in OTHERS],
         "cosine": {name: values["cosine"] for name, values in results[on_flat]["skills"].items()},
@@ -68,11 +68,11 @@ def measure(subject: Subject) -> dict:
 
 def _build(subject: Subject, trials: int) -> QuadrupedEnv:
     """Build the terrain of a policy with a level for each size, for `trials` of each skill."""
-    config = subject.rough()
-    ground = config.env.terrain
+    config, ground = subject.rough(), subject.terrain
     ground.levels = LARGEST - SMALLEST + 1
     own, ends = ground.types, [SMALLEST / 100, LARGEST / 100]
     ground.types = {name: own[name] | {key: ends} for name, key in SIZES.items()}
+    config.env.terrain = ground
     return subject.make_env(config, trials * len(subject.skills), TIME_LIMIT)
 
 

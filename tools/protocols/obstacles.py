@@ -59,14 +59,13 @@ def measure(subject: Subject) -> dict:
     }
     results = subject.results({key: partial(counts, course) for course, key in keys.items()})
     return {
-        "scale": subject.rough().env.terrain.scale,
+        "scale": subject.terrain.scale,
         "courses": {course: results[key] for course, key in keys.items()},
     }
 
 
 def _build(subject: Subject, terrain: str, trials: int) -> QuadrupedEnv:
-    config = subject.rough()
-    ground = config.env.terrain
+    config, ground = subject.rough(), subject.terrain
     ground.noise, ground.variants = (0.0, 0.0), 2
     if terrain == "slopes":
         ground.levels = len(ANGLES)
@@ -75,6 +74,7 @@ def _build(subject: Subject, terrain: str, trials: int) -> QuadrupedEnv:
         ground.levels = STEPS[-1] - STEPS[0] + 1
         risers = [STEPS[0] / 100, STEPS[-1] / 100]
         ground.types = {terrain: {"proportion": 1.0, "riser": risers, "tread": 0.3}}
+    config.env.terrain = ground
     worlds = trials * len(subject.skills)
     return subject.make_env(config, worlds, TIME_LIMIT)
 

@@ -24,6 +24,7 @@ TEXT = (
 )
 
 Setter = Callable[[RandomizationConfig, float], None]
+Round = Callable[[float], float]
 
 DURATION = 10.0  # s
 # At a friction of 0.1 and less the few of training leave contacts unsolved: worlds diverge, and
@@ -63,7 +64,7 @@ def sweeps(config: Config) -> list[Sweep]:
         low, high = trained(name)
         return 0.0, (high - low) / 2
 
-    def fixed(name: str, scale: float = 1.0, unit: type = float) -> Setter:
+    def fixed(name: str, scale: float = 1.0, unit: Round = float) -> Setter:
         return lambda r, value: setattr(r, name, (unit(value / scale), unit(value / scale)))
 
     def around(name: str, centre: float = 0.0) -> Setter:

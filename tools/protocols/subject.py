@@ -6,7 +6,7 @@ import copy
 import hashlib
 import itertools
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -15,13 +15,14 @@ from typing import Any
 import torch
 from tensordict import TensorDict
 
+from kiras_rl.config import ConfigError
 from kiras_rl.deploy.policy import OnboardPolicy, PolicyMetadata
 from kiras_rl.envs import resolve_backend
 from kiras_rl.envs.quadruped import QuadrupedEnv
 from kiras_rl.evaluation.flat import Policy
 from kiras_rl.phases import FINETUNING, SKILL_LEARNING, phase_config
 from kiras_rl.robots.robot import Robot
-from kiras_rl.schema import Config
+from kiras_rl.schema import Config, TerrainConfig
 from kiras_rl.tools.evaluator import (
     evaluation_physics,
     make_evaluation_env,
@@ -120,9 +121,8 @@ class Subject:
         label = _label(file if source is None else source)
         about = _describe(label, file, onboard.metadata)
         if folder is None:
-            is_run = source is not None and source.is_dir()
-            place = source / "evaluation" if is_run else Path("evaluation") / label
-            ledger = Ledger.beside(place, about)
+            in_run = source / "evaluation" if source is not None and source.is_dir() else None
+            ledger = Ledger.beside(in_run or Path("evaluation") / label, about)
         else:
             ledger = Ledger(folder, about)
         return cls(label, file, onboard, ledger, options)
@@ -142,7 +142,7 @@ class Subject:
 
         return act
 
-    def results(self, pieces: dict[str, Callable[[], dict | list]]) -> dict[str, Any]:
+    def results(self, pieces: Mapping[str, Callable[[], dict | list]]) -> dict[str, Any]:
         """Return the results by key; what the ledger lacks is measured, and kept piece by piece.
 
         Args:
@@ -189,6 +189,18 @@ class Subject:
         for capacity in ("max_contacts", "max_constraints", "max_ccd"):
             setattr(config.sim, capacity, getattr(standard.sim, capacity))
         return config
+
+    @property
+    def terrain(self) -> TerrainConfig:
+        """The robot's standard terrain, to be changed.
+
+        Raises:
+            ConfigError: The robot's standard has none.
+        """
+        terrain = self.rough().env.terrain
+        if terrain is None:
+            raise ConfigError(f"the standard configuration of {self.run.robot} has no terrain")
+        return terrain
 
     def make_env(self, config: Config, num_envs: int, duration: float) -> QuadrupedEnv:
         """Build an environment for trials of the policy's own robot; see `make_evaluation_env`."""

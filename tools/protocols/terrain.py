@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache, partial
 
 import torch
@@ -48,14 +49,14 @@ def measure(subject: Subject) -> dict:
 def terrain_env(subject: Subject, trials: int) -> QuadrupedEnv:
     """Build the terrain of a policy with LEVELS levels, for `trials` of each skill."""
     config = subject.rough()
-    config.env.terrain.levels = LEVELS
+    config.env.terrain = replace(subject.terrain, levels=LEVELS)
     worlds = trials * len(subject.skills)
     return subject.make_env(config, worlds, TIME_LIMIT)
 
 
 def rough_names(subject: Subject) -> list[str]:
     """Return the terrain types of a policy that are not flat."""
-    types = subject.rough().env.terrain.types
+    types = subject.terrain.types
     return list(rough_types([name for name, values in types.items() if values is not None]))
 
 

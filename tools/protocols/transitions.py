@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict
+from dataclasses import asdict, replace
 
 import torch
 
@@ -116,7 +116,7 @@ def measure(subject: Subject) -> dict:
 
 def _rough(subject: Subject) -> Config:
     config = subject.rough()
-    config.env.terrain.levels, config.env.terrain.variants = ROUGH_LEVELS, VARIANTS
+    config.env.terrain = replace(subject.terrain, levels=ROUGH_LEVELS, variants=VARIANTS)
     return config
 
 

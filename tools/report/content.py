@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 from matplotlib.figure import Figure as Drawing
@@ -50,7 +51,7 @@ class Table:
 
     title: str
     columns: tuple[Column, ...]
-    rows: list[tuple[Cell, ...]]
+    rows: Sequence[tuple[Cell, ...]]
     note: str = ""
 
     def __post_init__(self) -> None:
@@ -69,8 +70,9 @@ class Table:
         goal = {"low": min, "high": max, "": None}[self.columns[index].best]
         groups: dict[Cell, dict[int, float]] = {}
         for i, row in enumerate(self.rows):
-            if isinstance(row[index], int | float) and row[index] == row[index]:
-                groups.setdefault(row[0], {})[i] = row[index]
+            value = row[index]
+            if isinstance(value, int | float) and value == value:
+                groups.setdefault(row[0], {})[i] = value
         return {
             i
             for values in groups.values()

@@ -11,6 +11,7 @@ import webbrowser
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from PIL import Image
 from PIL.PngImagePlugin import PngInfo
@@ -29,8 +30,11 @@ from kiras_rl.tools.viewer.stage import Stage
 from kiras_rl.tools.viewer.terminal import Terminal, open_screen
 from kiras_rl.tools.viewer.view import View
 
+if TYPE_CHECKING:
+    from playwright.sync_api import ViewportSize
+
 SCREENSHOT = "kiras-play --screenshot"
-_WINDOW = {"width": 1280, "height": 800}
+_WINDOW: ViewportSize = {"width": 1280, "height": 800}
 _SLOW = 3.0  # pictures a second that a browser without a GPU can draw
 _QUALITY = 88  # of a JPEG: small, and the letters stay clear
 
@@ -156,7 +160,8 @@ def save_screenshot(cockpit: Cockpit, path: Path, speed: float) -> None:
         loop.join()
     about = PngInfo()
     about.add_text("Software", SCREENSHOT)
-    marks = {"pnginfo": about} if path.suffix == ".png" else {"comment": SCREENSHOT.encode()}
+    is_png = path.suffix == ".png"
+    marks: dict[str, Any] = {"pnginfo": about} if is_png else {"comment": SCREENSHOT.encode()}
     with Image.open(io.BytesIO(picture)) as image:
         image.convert("RGB").save(path, quality=_QUALITY, optimize=True, **marks)
 
