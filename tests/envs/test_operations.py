@@ -13,7 +13,7 @@ from kiras_rl.config import load_config
 from kiras_rl.envs import make_env
 from kiras_rl.phases import FINETUNING, SKILL_LEARNING, phase_config
 
-LIMITS = {SKILL_LEARNING: 555, FINETUNING: 1035}
+LIMITS = {SKILL_LEARNING: 575, FINETUNING: 1110}
 """Operations of a step at most: those of today, and a few for terms to come."""
 
 WAITS = {
