@@ -89,14 +89,14 @@ def save(rows: np.ndarray, metadata: PolicyMetadata, path: Path, events: list[st
     times = fresh["reading"]["time"]
     last = np.arange(count) == count - 1
     path.mkdir(parents=True)
-    np.savez_compressed(
-        path / "dataset.npz",
-        episode=np.zeros(count, np.int64),
-        skill=fresh["order"]["skill"].astype(np.int64),
-        done=last,
-        fallen=np.zeros(count, bool),
+    arrays: dict[str, Any] = {
+        "episode": np.zeros(count, np.int64),
+        "skill": fresh["order"]["skill"].astype(np.int64),
+        "done": last,
+        "fallen": np.zeros(count, bool),
         **values,
-    )
+    }
+    np.savez_compressed(path / "dataset.npz", **arrays)
     header = {
         "format": 1,
         "robot": metadata.robot,

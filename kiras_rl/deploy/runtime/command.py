@@ -161,6 +161,7 @@ class Session:
         )
         self._by_keyboard = options.keyboard
         self._hand = Hand(self._meta)
+        self._remote: Remote | None = None
         self._interrupts = self._saved = self._faults = 0
         self._state = State.OFF
         self._requests = 0
@@ -188,7 +189,8 @@ class Session:
         """Return what the operator holds: the script, a gamepad where there is one, or the keys."""
         if self._script is not None:
             return self._script
-        self._remote = Remote() if self._setup.link == "go1" else None
+        if self._setup.link == "go1":
+            self._remote = Remote()
         pad = Gamepad()
         if not self._by_keyboard and pad.poll(self._hand, 0):
             return pad
@@ -214,7 +216,7 @@ class Session:
         if isinstance(device, Script):
             device.follow(self._state)
         connected = device.poll(self._hand, now)
-        if getattr(self, "_remote", None) is not None and reading is not None:
+        if self._remote is not None and reading is not None:
             connected |= self._remote.take(self._hand, reading["remote"].tobytes())
         wish = self._hand.wish(now, connected)
         self._channel.wishes.put(wish)

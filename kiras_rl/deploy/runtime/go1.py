@@ -191,9 +191,8 @@ class Go1(Link):
         newest, torn = None, False
         for data in self._datagrams():
             state = decode(data)
-            is_new = state is not None and self._is_newer(int(state["tick"]))
             torn |= state is None
-            if is_new:
+            if state is not None and self._is_newer(int(state["tick"])):
                 newest, self._tick = state, int(state["tick"])
         if newest is None:
             late = self._tick is not None and now - self._heard > SILENT * NANO

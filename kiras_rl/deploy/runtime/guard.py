@@ -60,7 +60,7 @@ class Guard:
 
     def _is_sound(self, order: np.ndarray, now: int) -> bool:
         numbers = np.concatenate([order["target"], order["kp"], order["kd"]])
-        return bool(np.isfinite(numbers).all()) and order["time"] <= now + FUTURE * NANO
+        return bool(np.isfinite(numbers).all()) and int(order["time"]) <= now + FUTURE * NANO
 
     def _is_early(self, now: int) -> bool:
         return int(self._order["time"]) > now + FUTURE * NANO

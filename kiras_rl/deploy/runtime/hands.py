@@ -165,7 +165,7 @@ class Gamepad:
             return True
         except OSError:
             pass
-        self._lose(hand)  # pulled out: nobody holds the sticks
+        self._lose(self._file, hand)  # pulled out: nobody holds the sticks
         return False
 
     def _open(self) -> None:
@@ -176,8 +176,8 @@ class Gamepad:
                 continue
             return
 
-    def _lose(self, hand: Hand) -> None:
-        os.close(self._file)
+    def _lose(self, file: int, hand: Hand) -> None:
+        os.close(file)
         self._file = None
         hand.press(STOP)
         hand.hold(HELD, False)

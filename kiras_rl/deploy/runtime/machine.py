@@ -146,19 +146,19 @@ class Runtime:
 
     def _take(self, reading: np.ndarray, wish: np.ndarray | None, now: int) -> None:
         """Follow the operator: requests, skill, command; or the lack of one."""
-        here = wish is not None and bool(wish["connected"])
-        if here and self._seen is None:
-            self._requests = int(wish["requests"])  # pressed before this runtime began
-        if here:
-            self._seen = max(self._seen or 0, int(wish["time"]))
+        here = wish if wish is not None and wish["connected"] else None
+        if here is not None and self._seen is None:
+            self._requests = int(here["requests"])  # pressed before this runtime began
+        if here is not None:
+            self._seen = max(self._seen or 0, int(here["time"]))
         silence = (now - self._seen) / NANO if self._seen is not None else np.inf
-        heard = here and silence <= SILENT
-        self._steer(wish if heard else None)
+        heard = here if silence <= SILENT else None
+        self._steer(heard)
         if silence > LOST:
             self._lower(now, "the operator is lost")
-        if heard and int(wish["requests"]) != self._requests:
-            self._requests = int(wish["requests"])
-            self._answer(Request(int(wish["request"])), reading, now)
+        if heard is not None and int(heard["requests"]) != self._requests:
+            self._requests = int(heard["requests"])
+            self._answer(Request(int(heard["request"])), reading, now)
 
     def _steer(self, wish: np.ndarray | None) -> None:
         """Bring the command towards the operator's, within its range."""

@@ -8,6 +8,7 @@ import os
 import signal
 import sys
 import time
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -137,7 +138,7 @@ def run(setup: Setup) -> None:
 _RESTING = (State.OFF, State.CONNECTED, State.CALIBRATED, State.LYING, State.DAMPED)
 
 
-def _until_told() -> object:
+def _until_told() -> Callable[[], bool]:
     """Return a function that tells whether SIGTERM has come; Ctrl-C is the operator's alone."""
     told = []
     signal.signal(signal.SIGTERM, lambda number, frame: told.append(number))

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
-
 from kiras_rl.deploy.metadata import PolicyMetadata
 from kiras_rl.deploy.runtime.hands import HELD, Hand
 from kiras_rl.deploy.runtime.messages import NANO, Request, State
@@ -58,7 +56,8 @@ def _parse(word: str, metadata: PolicyMetadata) -> Step:
         ) from None
     if len(command) > 3:
         raise ScriptError(f"--script: '{word}' has more than seconds, v_x, v_y and yaw rate")
-    return Step(Request.WALK, None, index, seconds, (*command, *(0.0,) * (3 - len(command))))
+    v_x, v_y, yaw_rate = (*command, 0.0, 0.0, 0.0)[:3]
+    return Step(Request.WALK, None, index, seconds, (v_x, v_y, yaw_rate))
 
 
 class Script:
@@ -103,7 +102,7 @@ class Script:
             self._since = now if step.ends_in is None else None
         elif self._state == State.POLICY:
             hand.choose(step.skill)
-            hand.set_command(np.array(step.command))
+            hand.set_command(step.command)
             self._since = now
         else:
             hand.press(Request.WALK)

@@ -115,7 +115,8 @@ class SimulatedRobot(Link):
         self.plant = plant
         self._steps = round(1 / (rate * STEP))
         joints = len(plant.torque)
-        rest = (Mode.OFF, *np.zeros((3, joints)))
+        nothing = np.zeros(joints)
+        rest: Action = (Mode.OFF, nothing, nothing, nothing)
         self._queue = deque([rest] * (round(DELAY / STEP) + 1), round(DELAY / STEP) + 1)
         self._calibrated = False
 
