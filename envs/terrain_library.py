@@ -7,10 +7,9 @@ import zlib
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, TypeVar, overload
+from typing import TYPE_CHECKING, Any, TypeVar, overload
 
 import numpy as np
-import torch
 
 from kiras_rl.config import ConfigError
 from kiras_rl.envs import terrains
@@ -18,6 +17,9 @@ from kiras_rl.envs.lookup import find_function
 from kiras_rl.envs.relief import SINK, ground_grid
 from kiras_rl.envs.terrains import HALF, Draw, Tile, side_bounds
 from kiras_rl.schema import TerrainConfig
+
+if TYPE_CHECKING:  # a viewer of policies does without
+    import torch
 
 MAX_BOXES = 48
 """Boxes of a tile at most: more cost too much in MuJoCo-Warp, which compares all with all."""
@@ -29,7 +31,7 @@ _PARKED_SIZE = (0.1, 0.1, 0.1)  # m
 PARKED = (0.0, 0.0, -50.0)
 """Where geoms lie that a tile does not need, m."""
 
-Index = TypeVar("Index", np.ndarray, torch.Tensor)  # of integers
+Index = TypeVar("Index", np.ndarray, "torch.Tensor")  # of integers
 
 
 @dataclass(frozen=True, eq=False)
