@@ -218,7 +218,7 @@ def test_telemetry_keeps_the_last_seconds_oldest_first(cockpit):
     assert len(kept["time"]) == 8.0 / DT
     np.testing.assert_allclose(np.diff(kept["time"]), DT)
     assert kept["time"][-1] == pytest.approx(9.0)
-    assert set(kept["target_height"]) == {0.1}
+    assert set(kept["target_height"]) == {0.12}
 
 
 def test_only_a_policy_with_an_estimator_has_an_estimate(

@@ -70,7 +70,7 @@ def test_the_screen_says_what_is_and_what_is_asked_for(still_file):
     for _ in range(50):
         cockpit.advance()
     text = "\n".join(lines(cockpit, View()))
-    for part in ("my policy", "[2 crawl]", "v_x", "+0.30", "10.0", "estimated v_x", "P push"):
+    for part in ("my policy", "[2 crawl]", "v_x", "+0.30", "12.0", "estimated v_x", "P push"):
         assert part in text
     assert "terrain flat" in text
     assert "crossed" not in text
