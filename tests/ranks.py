@@ -65,23 +65,23 @@ def collect(phase: str) -> dict:
     st = alg.storage
     st.dones[::5, :3] = 1
     st.task_rewards += st.actions.sum(dim=-1, keepdim=True)  # advantages that gradients tell
-    if alg.reference:
+    if "retention" in alg.parts:
         st.observations[names.FLAT_ACTION] += torch.randn(STEPS, 2 * WORLDS, 8)  # else no loss
         st.observations[names.IS_FLAT] = (world < 2).expand(STEPS, -1).unsqueeze(-1)
-    if alg.imitation:
-        alg.imitation._valid[:] = world % 3 > 0
+    if imitation := alg.parts.get("imitation"):
+        imitation._valid[:] = world % 3 > 0
     return {
         "storage": {
             k: v.clone() for k, v in vars(st).items() if isinstance(v, torch.Tensor) and v.dim() > 1
         },
         "observations": st.observations.clone(),
         "last": runner.env.get_observations(),
-        "imitation": _pairs(alg) if alg.imitation else {},
+        "imitation": _pairs(imitation) if imitation else {},
     }
 
 
-def _pairs(alg) -> dict:
-    return {name: getattr(alg.imitation, name) for name in ("_pairs", "_valid", "_rewards")}
+def _pairs(imitation) -> dict:
+    return {name: getattr(imitation, name) for name in ("_pairs", "_valid", "_rewards")}
 
 
 def gradients(phase: str, rollout: dict, worlds: slice) -> dict[str, torch.Tensor]:
@@ -92,14 +92,14 @@ def gradients(phase: str, rollout: dict, worlds: slice) -> dict[str, torch.Tenso
         setattr(alg.storage, name, value[mine].clone())
     alg.storage.observations = rollout["observations"][mine].clone()
     for name, value in rollout["imitation"].items():
-        setattr(alg.imitation, name, value[mine].clone())
+        setattr(alg.parts["imitation"], name, value[mine].clone())
     with torch.no_grad():
         alg.compute_returns(rollout["last"][worlds])
     with drawn_alike():
         alg.update()
-    networks = {"actor": alg.actor, "critics": alg.critic, "estimator": alg.estimation.estimator}
-    if alg.imitation:
-        networks["discriminator"] = alg.imitation.discriminator
+    networks = {"actor": alg.actor, "critics": alg.critic}
+    for name in {"estimator", "imitation"} & alg.parts.keys():
+        networks |= alg.parts[name].networks()
     return {
         name: torch.cat([p.grad.flatten() for p in network.parameters() if p.grad is not None])
         for name, network in networks.items()

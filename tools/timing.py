@@ -88,7 +88,7 @@ class PartTimer:
         self._wrapped.append((owner, method))
 
     def wrap_all(self, root: Any, parts: Iterable[tuple[str, str, str]]) -> None:
-        """Time (owner, method, part) each; an owner is named from `root`, as `alg.imitation`.
+        """Time (owner, method, part) each; an owner is named from `root`, as `alg.parts.imitation`.
 
         An owner that does not exist has nothing to time.
         """
