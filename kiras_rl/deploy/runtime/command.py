@@ -19,7 +19,7 @@ from kiras_rl.deploy.runtime.blackbox import Ring, save
 from kiras_rl.deploy.runtime.driver import Channel, LinkError, keep_pace
 from kiras_rl.deploy.runtime.hands import EMERGENCY, Gamepad, Hand, Keyboard, Remote
 from kiras_rl.deploy.runtime.mailbox import SHARED, BusyError
-from kiras_rl.deploy.runtime.messages import Mode, Request, State
+from kiras_rl.deploy.runtime.messages import NANO, Mode, Request, State
 from kiras_rl.deploy.runtime.processes import ROLES, Setup
 from kiras_rl.deploy.runtime.profiles import Profile, profile_of
 from kiras_rl.deploy.runtime.scripts import Script, ScriptError, parse_script
@@ -41,6 +41,7 @@ something was wrong with what was given.
 _RATE = 50.0  # Hz, of the operator
 _GRACE = 10.0  # s that the robot has to lie down and end
 _DEFAULT = "solo8"
+_NOTICED = 0.5  # s in which the runtime finds out that the driver is gone, damps and says so
 _REFUSED = 2  # exit status of a process that cannot begin
 
 
@@ -165,6 +166,7 @@ class Session:
         self._interrupts = self._saved = self._faults = 0
         self._state = State.OFF
         self._requests = 0
+        self._driven = 0  # when the driver was last there, ns
 
     def run(self) -> int:
         """Run until the robot lies and the operator has left; return the exit status."""
@@ -227,7 +229,9 @@ class Session:
         over = self._children["runtime"].poll() is not None
         if self._interrupts > 1:
             over |= reading is None or Mode(int(reading["mode"])) in (Mode.DAMP, Mode.OFF)
-        return over or self._children["driver"].poll() is not None
+        if self._children["driver"].poll() is None:
+            self._driven = now
+        return over or now - self._driven > _NOTICED * NANO
 
     def _follow(self, state: State) -> None:
         if state == State.DAMPED and self._state != State.DAMPED:
