@@ -16,6 +16,7 @@ from torch.utils.tensorboard import SummaryWriter
 from kiras_rl import __version__, checkpoint, distributed
 from kiras_rl import interfaces as names
 from kiras_rl.algorithms.kiras import KirasPPO
+from kiras_rl.classes import find_class
 from kiras_rl.config import config_to_dict
 from kiras_rl.deploy.metadata import FORMAT as METADATA_FORMAT
 from kiras_rl.evaluation.flat import Policy, SkillResult, as_scalars, score
@@ -87,6 +88,8 @@ class KirasRunner(OnPolicyRunner):
         torch.manual_seed(config.seed + distributed.rank())
         self.config, self.run_dir, self.phase = config, run_dir, phase
         settings = rsl_rl_config(config, phase, env.step_dt)
+        name = config.learner.class_name
+        settings["algorithm"]["class_name"] = find_class("learner.class_name", name, KirasPPO)
         super().__init__(env, settings, log_dir=None, device=device)
         self.alg.broadcast_parameters()
         self._first = 0 if phase == SKILL_LEARNING else config.iterations
@@ -359,7 +362,7 @@ class KirasRunner(OnPolicyRunner):
         self.alg.load(content["learner"], load_cfg, strict)
         self.current_learning_iteration = content["iteration"]
         self.seconds, self.best_score = content["seconds"], content["best_score"]
-        self.scores = content.get("scores", [])  # a checkpoint of an earlier version has none
+        self.scores = content["scores"]
         self.best_networks = content["best_networks"]
         provenance = content["description"]["provenance"]
         self.steps, self.begun_from = provenance["steps"], provenance.get("begun_from")

@@ -296,11 +296,13 @@ class KirasPPO(PPO):
 
     # --- construction, modes, state -------------------------------------------------------------
 
-    @staticmethod
-    def construct_algorithm(obs: TensorDict, env: SkillEnv, cfg: dict, device: str) -> KirasPPO:
+    @classmethod
+    def construct_algorithm(
+        cls, obs: TensorDict, env: SkillEnv, cfg: dict, device: str
+    ) -> KirasPPO:
         """Build the learner of a phase; see `build_learner` for the arguments."""
         learner = build_learner(obs, env, cfg, device)
-        return KirasPPO(learner, cfg["learner"], cfg["iterations"], device)
+        return cls(learner, cfg["learner"], cfg["iterations"], device)
 
     def networks(self) -> dict:
         """Return copies of all weights that go on into the next phase."""
@@ -340,8 +342,7 @@ class KirasPPO(PPO):
 
     def load(self, loaded_dict: dict, load_cfg: dict | None = None, strict: bool = True) -> bool:
         """Load what `save` returned."""
-        super().load(loaded_dict, load_cfg, strict)
-        self.learning_rate = self.trainer.rate  # loading took a copy
+        super().load(loaded_dict, load_cfg or {"actor": True, "critic": True}, strict)
         self.trainer.load_state_dict(loaded_dict["optimizer_state_dict"])
         self._rollout.forget()
         self.iteration = loaded_dict["iteration"]

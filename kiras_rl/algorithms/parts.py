@@ -6,7 +6,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
-from rsl_rl.utils import resolve_callable
 from tensordict import TensorDict
 
 from kiras_rl import interfaces as names
@@ -14,6 +13,7 @@ from kiras_rl.algorithms.estimation import Estimation
 from kiras_rl.algorithms.part import Part, Setting
 from kiras_rl.algorithms.residual import Reference
 from kiras_rl.algorithms.storage import GroupRolloutStorage
+from kiras_rl.classes import find_class
 from kiras_rl.config import ConfigError
 from kiras_rl.imitation.self_imitation import SelfImitation
 from kiras_rl.interfaces import SkillEnv
@@ -71,9 +71,7 @@ def build_learner(obs: TensorDict, env: SkillEnv, cfg: dict, device: str) -> Lea
     config: LearnerConfig = cfg["learner"]
     half = uses_bfloat16(config.precision, device)
     setting = Setting(obs, env, config, device, half, cfg["reward_scale"])
-    parts = {
-        name: kind.build(block, setting) for name, kind, block in _blocks(config, cfg[RETENTION])
-    }
+    parts = dict(_build_parts(setting, cfg[RETENTION]))
     for part in parts.values():
         obs = TensorDict({**obs, **part.groups(obs)}, batch_size=obs.batch_size)
     groups = {
@@ -98,30 +96,24 @@ def reward_groups(parts: dict[str, Part]) -> list[Part]:
     return [part for part in parts.values() if part.reward_group]
 
 
-def _blocks(config: LearnerConfig, retention: Any) -> Iterator[tuple[str, type[Part], Any]]:
-    """Yield name, class and block of every part that is configured."""
+def _build_parts(setting: Setting, retention: Any) -> Iterator[tuple[str, Part]]:
+    """Yield name and part of every block that is configured."""
+    config = setting.config
     for name, kind in KIRAS.items():
-        if getattr(config, name) is not None:
-            yield name, kind, getattr(config, name)
+        if (block := getattr(config, name)) is not None:
+            yield name, kind.build(block, setting)
     for name, values in config.parts.items():
         if values is not None:
-            block = dict(values)
-            yield name, find_part(name, block.pop("class_name", None)), block
+            yield name, _build_named(f"learner.parts.{name}", dict(values), setting)
     if retention is not None:
-        yield RETENTION, Reference, retention
+        yield RETENTION, Reference.build(retention, setting)
 
 
-def find_part(name: str, class_name: str | None) -> type[Part]:
-    """Return the class that a block of `learner.parts` names, as in package.module:Class.
-
-    Raises:
-        ConfigError: No such class, or one that is no part.
-    """
-    where = f"learner.parts.{name}.class_name={class_name}"
+def _build_named(where: str, block: dict[str, Any], setting: Setting) -> Part:
+    kind = find_class(f"{where}.class_name", block.pop("class_name", None), Part)
     try:
-        found = resolve_callable(class_name or "")
-    except (ImportError, AttributeError, ValueError, TypeError) as error:
-        raise ConfigError(f"{where}: give a class as package.module:Class ({error})") from None
-    if not (isinstance(found, type) and issubclass(found, Part)):
-        raise ConfigError(f"{where}: not a kiras_rl.algorithms.part.Part")
-    return found
+        return kind.build(block, setting)
+    except (TypeError, KeyError) as error:
+        raise ConfigError(
+            f"{where}={block}: {kind.__name__} does not take this: {error}"
+        ) from error

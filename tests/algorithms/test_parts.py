@@ -6,6 +6,7 @@ import pytest
 import torch
 from torch import nn
 
+from kiras_rl.algorithms.kiras import KirasPPO
 from kiras_rl.algorithms.part import Part
 from kiras_rl.config import ConfigError
 
@@ -67,6 +68,10 @@ class Taught(Part):
         self.network.load_state_dict(state)
 
 
+class Patient(KirasPPO):
+    """An algorithm of a user's own."""
+
+
 def taught(lesson=0.3, class_name=f"{__name__}:Taught"):
     return f"learner.parts.taught={{class_name: '{class_name}', lesson: {lesson}}}"
 
@@ -95,6 +100,23 @@ def test_it_is_saved_and_goes_on_into_the_next_phase(make_runner):
 
 def test_null_leaves_it_out(make_runner):
     assert "taught" not in make_runner(taught(), "learner.parts.taught=null").alg.parts
+
+
+def test_what_a_part_does_not_take_is_refused(make_runner):
+    unknown = f"learner.parts.taught={{class_name: '{__name__}:Taught', lessen: 0.3}}"
+    with pytest.raises(ConfigError, match=r"learner\.parts\.taught=.*Taught does not take this"):
+        make_runner(unknown)
+
+
+@pytest.mark.parametrize("name", ["foo", "torch.nn:Linear", "rsl_rl.algorithms:PPO"])
+def test_an_algorithm_of_another_kind_is_refused(make_runner, name):
+    with pytest.raises(ConfigError, match=r"learner\.class_name="):
+        make_runner(f"learner.class_name={name}")
+
+
+def test_a_subclass_of_the_algorithm_is_used(make_runner):
+    runner = make_runner(f"learner.class_name={__name__}:Patient")
+    assert type(runner.alg) is Patient
 
 
 @pytest.mark.parametrize("name", ["nowhere.at_all:Part", "torch:nn", "torch.nn:Linear", "Taught"])

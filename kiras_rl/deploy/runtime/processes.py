@@ -93,12 +93,17 @@ def open_link(setup: Setup, policy: OnboardPolicy, profile: Profile) -> Link:
     return Solo8(open_socket(setup.address), offsets, torque, profile.damping)
 
 
+def _join(setup: Setup) -> tuple[OnboardPolicy, Profile, Channel]:
+    """Load the policy, and open the channel of its robot."""
+    policy = OnboardPolicy(setup.policy)
+    profile = profile_of(policy.metadata.robot)
+    return policy, profile, Channel(profile.name, Path(setup.root))
+
+
 def drive(setup: Setup) -> None:
     """Be the driver."""
     log = Log(setup.log, "driver")
-    policy = OnboardPolicy(setup.policy)
-    profile = profile_of(policy.metadata.robot)
-    channel = Channel(profile.name, Path(setup.root))
+    policy, profile, channel = _join(setup)
     channel.driver.take()
     link = open_link(setup, policy, profile)
     ring = Ring(channel.ring, round(LENGTH * profile.rate))
@@ -115,9 +120,7 @@ def drive(setup: Setup) -> None:
 def run(setup: Setup) -> None:
     """Be the runtime."""
     log = Log(setup.log, "runtime")
-    policy = OnboardPolicy(setup.policy)
-    profile = profile_of(policy.metadata.robot)
-    channel = Channel(profile.name, Path(setup.root))
+    policy, profile, channel = _join(setup)
     channel.runtime.take()
     runtime = Runtime(policy, profile, log, setup.deadman)
     _calm("runtime", log)
