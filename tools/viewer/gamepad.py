@@ -2,20 +2,14 @@
 
 from __future__ import annotations
 
-import os
-import struct
 from collections.abc import Callable
 from pathlib import Path
 
+from kiras_rl.deploy.joystick import AXIS, BUTTON, DEVICES, FULL, Joystick
 from kiras_rl.tools.viewer.cockpit import FORWARD, LEFT, YAW, Cockpit
 
-DEVICES = Path("/dev/input")
 NAMES = "left stick drives, right stick turns, A push, X reset, LB RB skills, Start pause"
 
-# struct js_event of linux/joystick.h: time in ms, value, type, number
-_EVENT = struct.Struct("<IhBB")
-_BUTTON, _AXIS = 0x01, 0x02  # with 0x80 more in what the kernel tells of a pad when it opens
-_FULL = 32767
 _DEAD = 0.12  # of the full deflection: where sticks come to rest
 # numbers of the kernel's xpad driver, which most pads speak
 _LEFT_X, _LEFT_Y, _RIGHT_X = 0, 1, 3
@@ -27,52 +21,35 @@ class Gamepad:
 
     def __init__(self, cockpit: Cockpit, devices: Path = DEVICES) -> None:
         """Look for a pad in a folder of devices."""
-        self._cockpit, self._devices = cockpit, devices
-        self._file: int | None = None
+        self._cockpit = cockpit
+        self._stick = Joystick(devices, every=100)  # two seconds of a control loop
         self._axes: dict[int, float] = {}
         self._moved = False
-        self._calls = 0
 
     @property
     def connected(self) -> bool:
         """Whether there is one."""
-        return self._file is not None
+        return self._stick.connected
 
     def poll(self) -> None:
         """Read what has happened since the last call."""
-        if self._file is None:
-            if self._calls % 100 == 0:  # every two seconds of a control loop
-                self._open()
-            self._calls += 1
-            return
-        try:
-            while len(data := os.read(self._file, _EVENT.size)) == _EVENT.size:
-                self._take(*_EVENT.unpack(data)[1:])
-        except BlockingIOError:
-            pass
-        except OSError:  # pulled out: nobody holds the stick
-            self.close()
+        events = self._stick.events()
+        if events is None:
+            self._axes = {}  # pulled out: nobody holds the stick
+        for event in events or ():
+            self._take(*event)
         self._steer()
 
     def close(self) -> None:
         """Let go of the device."""
-        if self._file is not None:
-            os.close(self._file)
-        self._file, self._axes = None, {}
-
-    def _open(self) -> None:
-        for path in sorted(self._devices.glob("js*")):
-            try:
-                self._file = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
-            except OSError:  # not ours to read
-                continue
-            return
+        self._stick.close()
+        self._axes = {}
 
     def _take(self, value: int, kind: int, number: int) -> None:
-        if kind == _AXIS:  # what an axis says before it moves may be a rest at one of its ends
-            share = value / _FULL
+        if kind == AXIS:  # what an axis says before it moves may be a rest at one of its ends
+            share = value / FULL
             self._axes[number] = share if abs(share) > _DEAD else 0.0
-        elif kind == _BUTTON and value:
+        elif kind == BUTTON and value:
             self._press(number)
 
     def _press(self, button: int) -> None:

@@ -12,10 +12,10 @@ from pathlib import Path
 
 import numpy as np
 
+from kiras_rl.deploy.joystick import AXIS, BUTTON, DEVICES, FULL, Joystick
 from kiras_rl.deploy.metadata import PolicyMetadata
 from kiras_rl.deploy.runtime.messages import NANO, WISH, Request
 
-DEVICES = Path("/dev/input")
 DEAD = 0.12  # of a stick's full deflection: where sticks come to rest
 
 # What a button or key does: a request, or one of these.
@@ -75,9 +75,6 @@ PAD_HELP = (
     "Start motors on   A stand up   X policy   Y lie down   B emergency stop   Back black box\n"
     "cross skill   left stick drives   right stick turns   Ctrl-C lie down, leave"
 )
-
-_EVENT = struct.Struct("<IhBB")  # struct js_event of linux/joystick.h: time, value, type, number
-_BUTTON, _AXIS = 0x01, 0x02
 
 
 class Hand:
@@ -147,49 +144,28 @@ class Gamepad:
 
     def __init__(self, devices: Path = DEVICES) -> None:
         """Look for a pad in a folder of devices."""
-        self._devices = devices
-        self._file: int | None = None
-        self._calls = 0
+        self._stick = Joystick(devices)
 
     def poll(self, hand: Hand, now: int) -> bool:
         """Tell the hand what has happened, and return whether there is a pad."""
-        if self._file is None and self._calls % 50 == 0:  # every second
-            self._open()
-        self._calls += 1
-        if self._file is None:
+        before, events = self._stick.connected, self._stick.events()
+        if events is None:
+            if before:  # pulled out: nobody holds the sticks
+                hand.press(STOP)
+                hand.hold(HELD, False)
             return False
-        try:
-            while len(data := os.read(self._file, _EVENT.size)) == _EVENT.size:
-                self._take(hand, *_EVENT.unpack(data)[1:])
-        except BlockingIOError:
-            return True
-        except OSError:
-            pass
-        self._lose(self._file, hand)  # pulled out: nobody holds the sticks
-        return False
-
-    def _open(self) -> None:
-        for path in sorted(self._devices.glob("js*")):
-            try:
-                self._file = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
-            except OSError:  # not ours to read
-                continue
-            return
-
-    def _lose(self, file: int, hand: Hand) -> None:
-        os.close(file)
-        self._file = None
-        hand.press(STOP)
-        hand.hold(HELD, False)
+        for event in events:
+            self._take(hand, *event)
+        return True
 
     def _take(self, hand: Hand, value: int, kind: int, number: int) -> None:
-        if kind == _AXIS and number in GAMEPAD_STICKS:
+        if kind == AXIS and number in GAMEPAD_STICKS:
             axis, sign = GAMEPAD_STICKS[number]
-            share = value / 32767
+            share = value / FULL
             hand.steer(axis, sign * share if abs(share) > DEAD else 0.0)
-        elif kind == _AXIS and number == GAMEPAD_HAT and value:
+        elif kind == AXIS and number == GAMEPAD_HAT and value:
             hand.press(NEXT if value > 0 else PREVIOUS)
-        elif kind == _BUTTON and number in GAMEPAD_BUTTONS:
+        elif kind == BUTTON and number in GAMEPAD_BUTTONS:
             _change(hand, GAMEPAD_BUTTONS[number], bool(value))
 
 
