@@ -19,6 +19,10 @@ from kiras_rl.deploy.runtime.profiles import Profile
 # Ours, where neither the policy file nor the robot's profile has a number.
 AGE = 2.0  # control periods that a reading may be old
 RANGE_MARGIN = 0.1  # rad that a joint may be beyond its range: a loaded joint passes its target
+# The same of a robot that lies, gets up or lies down: without torque legs fold to their stops,
+# farther than a policy may bend them: Go1's calves by 0.10 rad, Solo-8's knees in simulation by
+# 0.30.
+FOLDED_MARGIN = 0.4
 TORQUE_MARGIN = 1.2  # a motor that tells more than this times its limit does not obey it
 TILT = np.deg2rad(60.0)  # from the nearest keyframe that counts; the end of an episode in training
 TRACKING = 0.6  # rad between a slow target and its joint
@@ -212,7 +216,8 @@ class Checks:
         pos = self._joints(view, "joint_pos")
         beyond = np.maximum(self._low - pos, pos - self._high)
         worst = int(np.argmax(beyond))
-        if beyond[worst] <= RANGE_MARGIN:
+        stands = view.state in (State.STANDING, State.POLICY)
+        if beyond[worst] <= (RANGE_MARGIN if stands else FOLDED_MARGIN):
             return ""
         return (
             f"{self.metadata.joint_names[worst]} is at {pos[worst]:.2f} rad, "

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from kiras_rl.deploy.policy import OnboardPolicy
-from kiras_rl.deploy.runtime.checks import RANGE_MARGIN, TILT
+from kiras_rl.deploy.runtime.checks import FOLDED_MARGIN, RANGE_MARGIN, TILT
 from kiras_rl.deploy.runtime.driver import keep_pace
 from kiras_rl.deploy.runtime.messages import NANO
 from kiras_rl.deploy.runtime.profiles import Profile, profile_of
@@ -109,8 +109,9 @@ def _first_targets(policy: OnboardPolicy) -> Iterator[str]:
 
 def _limits(profile: Profile) -> Iterator[str]:
     yield (
-        f"checks       range + {RANGE_MARGIN:g} rad, tilt {np.rad2deg(TILT):.0f} degrees, "
-        f"power {profile.max_power:g} W, motors {profile.max_temperature:g} degrees Celsius, "
+        f"checks       range + {RANGE_MARGIN:g} rad ({FOLDED_MARGIN:g} lying), "
+        f"tilt {np.rad2deg(TILT):.0f} degrees, power {profile.max_power:g} W, "
+        f"motors {profile.max_temperature:g} degrees Celsius, "
         f"battery {100 * profile.min_battery:.0f} %"
     )
 

@@ -98,6 +98,16 @@ def test_a_joint_beyond_its_range_is_found(checks, metadata):
     assert found.text == "FL_HFE is at 1.58 rad, -1.45 to 1.45 are allowed"
 
 
+@pytest.mark.parametrize(("angle", "refused"), [(3.15, False), (3.25, True)])  # 2.80 and 0.4
+def test_legs_that_lie_fold_farther_than_a_policy_may_bend_them(checks, metadata, angle, refused):
+    ticks = Ticks(checks, metadata, state=State.CALIBRATED)
+    ticks.reading["time"] = ticks.now
+    ticks.reading["joint_pos"][1] = angle  # FL_KFE
+    why = checks.refusal(ticks.view())
+    assert (why == f"FL_KFE is at {angle:.2f} rad, -2.80 to 2.80 are allowed") is refused
+    assert bool(why) is refused
+
+
 def test_a_reading_that_is_old_is_found_after_two_periods(checks, metadata):
     ticks = Ticks(checks, metadata)
     ticks.step()
