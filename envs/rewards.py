@@ -119,6 +119,11 @@ def swing_peak(before: torch.Tensor, step: Step) -> torch.Tensor:
     return torch.maximum(before, step.robot.foot_clearance) * ~step.robot.foot_stands
 
 
+def descent(before: torch.Tensor, step: Step) -> torch.Tensor:
+    """Remember how fast each foot in the air comes down, (N, F), m/s."""
+    return (-step.robot.foot_vel_w[..., 2]).clamp(min=0.0) * ~step.robot.foot_stands
+
+
 @remembering(air_time)
 def feet_air_time(step: Step, target: float) -> torch.Tensor:
     """Return by how much the feet that land now were in the air longer than `target`, summed, s.
@@ -154,6 +159,12 @@ def low_swing(step: Step, factor: float) -> torch.Tensor:
     wanted = (factor * step.keyframes.clearance[step.task.skill])[:, None]
     lacking = (1.0 - step.memory[swing_peak] / wanted).clamp(min=0.0).square()
     return (lacking * _landing(step)).sum(-1) * ~step.stands
+
+
+@remembering(air_time, descent)
+def hard_landing(step: Step) -> torch.Tensor:
+    """Return the sum of squared speeds at which the feet that land came down, (m/s)^2."""
+    return (step.memory[descent].square() * _landing(step)).sum(-1) * ~step.stands
 
 
 @remembering(stance_time, air_time)

@@ -10,7 +10,7 @@ import torch
 
 from kiras_rl.config import ConfigError
 from kiras_rl.envs import rewards
-from kiras_rl.envs.rewards import RewardSum, air_time, stance_time, swing_peak
+from kiras_rl.envs.rewards import RewardSum, air_time, descent, stance_time, swing_peak
 from kiras_rl.envs.state import Keyframes, Limits, RobotState, Step, Task
 from kiras_rl.schema import RewardConfig
 
@@ -67,7 +67,12 @@ def crafted(command=(0.5, 0.0, 0.2), fresh=False, fallen=False):
             torque=torch.tensor([2.0, 4.0]),
         ),
         target=row(0.4, -1.4),
-        memory={air_time: row(0.12, 0.5), stance_time: row(0.0, 0.1), swing_peak: row(0.03, 0.02)},
+        memory={
+            air_time: row(0.12, 0.5),
+            stance_time: row(0.0, 0.1),
+            swing_peak: row(0.03, 0.02),
+            descent: row(0.8, 0.3),
+        },
         fresh=torch.tensor([fresh]),
         fallen=torch.tensor([fallen]),
         weight=20.0,
@@ -99,6 +104,7 @@ EXPECTED = {
     "short_swing": ({"least": 0.16}, 0.04 / 0.16),
     "short_stance": ({"least": 0.2}, 0.5),  # of the foot that lifts off now
     "low_swing": ({"factor": 1.5}, (1 - 0.03 / 0.06) ** 2),  # crawl's clearance is 4 cm
+    "hard_landing": ({}, 0.8**2),  # of the foot that stands now
     "idle_feet": ({"most": 0.11}, 2.0),  # both have been in the air for longer
     "flight": ({"feet": 2}, 1.0),
     "joint_limits": ({"margin": 0.1}, (0.7 - 0.5) + (1.7 - 1.4)),  # the targets are just inside
@@ -129,7 +135,7 @@ def test_every_term_is_tested():
     terms = {
         name for name, f in inspect.getmembers(rewards, inspect.isfunction)
         if f.__module__ == rewards.__name__ and not name.startswith("_")
-        and f not in (air_time, stance_time, swing_peak)
+        and f not in (air_time, stance_time, swing_peak, descent)
     }  # fmt: skip
     assert terms == set(EXPECTED)
 
@@ -151,7 +157,10 @@ def test_standing_still_is_asked_for_by_a_small_command(command, stands):
     assert value("stand_still_pose", step) == pytest.approx(0.3 + 0.3 if stands else 0.0)
 
 
-GAIT = ("feet_air_time", "short_swing", "short_stance", "low_swing", "idle_feet", "flight")
+GAIT = (
+    *("feet_air_time", "short_swing", "short_stance", "low_swing", "hard_landing"),
+    *("idle_feet", "flight"),
+)
 
 
 @pytest.mark.parametrize("name", GAIT)
