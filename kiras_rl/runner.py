@@ -22,9 +22,8 @@ from kiras_rl.deploy.metadata import FORMAT as METADATA_FORMAT
 from kiras_rl.evaluation.flat import Policy, SkillResult, as_scalars, score
 from kiras_rl.evaluation.terrain import TerrainResult
 from kiras_rl.interfaces import SkillEnv
-from kiras_rl.phases import SKILL_LEARNING, rsl_rl_config, total_iterations
+from kiras_rl.phases import Phase, total_iterations
 from kiras_rl.process import StopRequest, generator_states, set_generator_states, single_threaded
-from kiras_rl.schema import Config
 from kiras_rl.soundness import TrainingError, check_rollout, check_update
 from kiras_rl.status import Status
 
@@ -67,34 +66,30 @@ class KirasRunner(OnPolicyRunner):
     def __init__(
         self,
         env: SkillEnv,
-        config: Config,
+        phase: Phase,
         run_dir: Path | None,
         device: str,
         evaluators: Evaluators | None = None,
         commit: str = "unknown",
-        phase: str = SKILL_LEARNING,
     ) -> None:
         """Build the learner of a phase.
 
         Args:
             env: The training environment.
-            config: The run, all its phases.
+            phase: Which phase to train.
             run_dir: Folder of the run; None writes nothing.
             device: Of the networks.
             evaluators: Judge a policy without action noise, every evaluation.interval.
             commit: Of the source, for the provenance of the policy.
-            phase: Which phase to train.
         """
-        torch.manual_seed(config.seed + distributed.rank())
-        self.config, self.run_dir, self.phase = config, run_dir, phase
-        settings = rsl_rl_config(config, phase, env.step_dt)
-        name = config.learner.class_name
+        torch.manual_seed(phase.run.seed + distributed.rank())
+        self.config, self.run_dir, self.phase = phase.run, run_dir, phase
+        settings = phase.learner_settings(env.step_dt)
+        name = phase.config.learner.class_name
         settings["algorithm"]["class_name"] = find_class("learner.class_name", name, KirasPPO)
         super().__init__(env, settings, log_dir=None, device=device)
         self.alg.broadcast_parameters()
-        self._first = 0 if phase == SKILL_LEARNING else config.iterations
-        self._last = self._first + settings["iterations"]
-        self.current_learning_iteration = self._first
+        self.current_learning_iteration = phase.first
         self.evaluators, self.commit = evaluators or Evaluators(), commit
         self.evaluation: dict[str, SkillResult] = {}
         self.terrain: TerrainResult | None = None
@@ -138,7 +133,7 @@ class KirasRunner(OnPolicyRunner):
         """
         if init_at_random_ep_len:
             raise ValueError("set env.terminations.random_first_length instead")
-        last = self._last
+        last = self.phase.last
         if num_learning_iterations is not None:
             last = min(last, self.current_learning_iteration + num_learning_iterations)
         self._open_log()
@@ -150,7 +145,7 @@ class KirasRunner(OnPolicyRunner):
                 age = time.monotonic() - self._last_saved
                 if distributed.any_rank(age > 60.0 * self.config.checkpoint_minutes):
                     self.save_latest()
-            finished = self.current_learning_iteration >= self._last
+            finished = self.current_learning_iteration >= self.phase.last
             if finished and self.best_networks is None:  # nothing was evaluated
                 self.best_networks = self.alg.networks()
             self.save_latest()
@@ -190,7 +185,7 @@ class KirasRunner(OnPolicyRunner):
         self.seconds += seconds
         self._write(scalars)
         return Status(
-            phase=self.phase,
+            phase=self.phase.name,
             iteration=self.current_learning_iteration,
             iterations=total_iterations(self.config),
             steps=self.steps,
@@ -234,7 +229,8 @@ class KirasRunner(OnPolicyRunner):
 
     def _evaluate_when_due(self) -> dict[str, float]:
         interval, done = self.config.evaluation.interval, self.current_learning_iteration
-        if not self.evaluators.flat or not interval or (done % interval and done != self._last):
+        is_due = interval and (done % interval == 0 or done == self.phase.last)
+        if not self.evaluators.flat or not is_due:
             return {}
         begin = time.perf_counter()
         self.evaluation, self.terrain = distributed.from_main(self._evaluate)
@@ -310,7 +306,7 @@ class KirasRunner(OnPolicyRunner):
         policy = self.alg.policy()
         return {
             "config": config_to_dict(self.config),
-            "phase": self.phase,
+            "phase": self.phase.name,
             "skills": list(self.env.skills),
             "robot": self.env.robot_identity(),
             "iteration": self.current_learning_iteration,
@@ -354,9 +350,9 @@ class KirasRunner(OnPolicyRunner):
         """
         fresh = self.alg.world_state()
         content, own = self._read(path)
-        if content["phase"] != self.phase:
+        if content["phase"] != self.phase.name:
             raise checkpoint.CheckpointError(
-                f"{path} is of the phase {content['phase']}, not of {self.phase}"
+                f"{path} is of the phase {content['phase']}, not of {self.phase.name}"
             )
         self._resumed = True
         self.alg.load(content["learner"], load_cfg, strict)

@@ -13,7 +13,7 @@ import torch
 from kiras_rl import distributed, process
 from kiras_rl import interfaces as names
 from kiras_rl.config import load_config
-from kiras_rl.phases import FINETUNING, SKILL_LEARNING
+from kiras_rl.phases import FINETUNING, SKILL_LEARNING, phase_of, plan
 from kiras_rl.runner import KirasRunner
 from kiras_rl.tools.train import main
 from kiras_rl.tools.training import build
@@ -54,7 +54,7 @@ EVENTFUL = (
 def make_runner(num_envs: int, phase: str) -> KirasRunner:
     batch = f"learner.imitation.discriminator.batch_size={num_envs * STEPS}"
     overrides = [f"num_envs={num_envs}", batch, *ONE_STEP]
-    return build(load_config("smoke", overrides), None, phase)
+    return build(phase_of(load_config("smoke", overrides), phase), None)
 
 
 def collect(phase: str) -> dict:
@@ -122,9 +122,8 @@ def drawn_alike():
 
 def eventful(folder: str, *overrides: str) -> KirasRunner:
     """Build what a new process would."""
-    return build(
-        load_config("smoke", [*EVENTFUL, *overrides]), Path(folder).absolute(), SKILL_LEARNING
-    )
+    config = load_config("smoke", [*EVENTFUL, *overrides])
+    return build(plan(config)[0], Path(folder).absolute())
 
 
 def state_of(runner: KirasRunner) -> dict:

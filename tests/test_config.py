@@ -21,7 +21,7 @@ from kiras_rl.config import (
 )
 from kiras_rl.envs import make_env
 from kiras_rl.limits import LARGEST, LIMITS, SCHEDULES
-from kiras_rl.phases import FINETUNING, phase_config
+from kiras_rl.phases import FINETUNING, phase_of, plan
 from kiras_rl.ranges import RANGES, TERMS
 from kiras_rl.runner import KirasRunner
 from kiras_rl.schema import Config
@@ -138,19 +138,20 @@ def test_what_an_earlier_version_saved_of_finetuning_is_read():
     config = load_config("solo8")
     values = config_to_dict(config)
     values["finetuning"]["learner"]["estimator"]["learning_rate"] = 1e-3
-    assert phase_config(config_from_dict(values), FINETUNING) == phase_config(config, FINETUNING)
+    rebuilt = config_from_dict(values)
+    assert phase_of(rebuilt, FINETUNING).config == phase_of(config, FINETUNING).config
 
 
 @pytest.mark.parametrize("name", list_configs())
 def test_every_shipped_configuration_builds_a_learner(name):
     config = load_config(name, ["num_envs=2"])
-    runner = KirasRunner(make_env(config), config, None, "cpu")
+    runner = KirasRunner(make_env(config), plan(config)[0], None, "cpu")
     assert runner.env.num_envs == 2
 
 
 @pytest.mark.parametrize("name", [name for name in list_configs() if name != "solo8_quick"])
 def test_every_shipped_configuration_has_terrain_to_finetune_on(name):
-    assert phase_config(load_config(name), FINETUNING).env.terrain
+    assert phase_of(load_config(name), FINETUNING).config.env.terrain
 
 
 # --- refusals ------------------------------------------------------------------------------------
@@ -234,7 +235,7 @@ def test_the_page_on_configuration_shows_every_range():
 )
 def test_what_is_outside_of_its_range_is_refused(override):
     with pytest.raises(ConfigError) as caught:
-        phase_config(load_config("solo8", [override]), FINETUNING)
+        phase_of(load_config("solo8", [override]), FINETUNING)
     assert override.partition("=")[0].removeprefix("finetuning.") in str(caught.value)
     assert "\n" not in str(caught.value)
 
@@ -341,7 +342,7 @@ def test_of_every_group_of_terms_one_is_left(key):
 def test_the_changes_of_finetuning_are_looked_at_with_what_they_change(override, message):
     config = load_config("solo8", [f"finetuning.{override}"])
     with pytest.raises(ConfigError) as caught:
-        phase_config(config, FINETUNING)
+        phase_of(config, FINETUNING)
     assert str(caught.value) == f"finetuning: {override}: {message}"
 
 

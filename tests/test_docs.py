@@ -18,7 +18,7 @@ import pytest
 from kiras_rl.config import list_configs, load_config
 from kiras_rl.envs import rewards
 from kiras_rl.envs.state import Step
-from kiras_rl.phases import FINETUNING, phase_config
+from kiras_rl.phases import FINETUNING, phase_of
 from kiras_rl.robots.robot import load_robot
 from kiras_rl.tools.curves import read_scalars
 from kiras_rl.tools.sweep import load_sweep
@@ -177,15 +177,15 @@ def test_the_example_configurations_load(tmp_path):
     ]
     assert mine.env.rewards.terms["lin_vel_y"] is None
     assert mine.learner.skill_init is None
-    assert phase_config(steeper, FINETUNING).env.terrain.scale == 1.5
-    assert phase_config(steeper, FINETUNING).iterations == 4000
+    assert phase_of(steeper, FINETUNING).config.env.terrain.scale == 1.5
+    assert phase_of(steeper, FINETUNING).config.iterations == 4000
 
 
 @pytest.fixture(scope="module")
 def tags(smoke_run) -> set[str]:
     """Return the tags that a run of `smoke` wrote, skills and terms as the page spells them."""
     skills = "|".join(sorted(load_robot("solo8").skills, key=len, reverse=True))
-    types = "|".join(phase_config(load_config("smoke"), FINETUNING).env.terrain.types)
+    types = "|".join(phase_of(load_config("smoke"), FINETUNING).config.env.terrain.types)
     patterns = (
         (rf"_({skills})(?=/|$)", "_<skill>"),
         (rf"_({types})$", "_<type>"),

@@ -112,12 +112,13 @@ def test_an_observation_reaches_the_robot(tmp_path):
     from kiras_rl.checkpoint import load_policy
     from kiras_rl.deploy.policy import OnboardPolicy
     from kiras_rl.export import export_policy
+    from kiras_rl.phases import plan
     from kiras_rl.runner import KirasRunner
 
     env, config = make_env("solo8_roll")
     for _ in range(3):
         obs, *_ = env.step(5 * torch.randn(4, 8))  # tumbling
-    KirasRunner(env, config, None, "cpu").save(str(tmp_path / "run.pt"))
+    KirasRunner(env, plan(config)[0], None, "cpu").save(str(tmp_path / "run.pt"))
     policy = OnboardPolicy(
         export_policy(*load_policy(tmp_path / "run.pt"), tmp_path / "p.onnx").path
     )
@@ -157,10 +158,10 @@ def test_a_terrain_is_a_function_and_a_line():
     from kiras_rl.config import load_config
     from kiras_rl.envs.ground import Ground
     from kiras_rl.envs.terrain_library import build_library
-    from kiras_rl.phases import FINETUNING, phase_config
+    from kiras_rl.phases import FINETUNING, phase_of
 
     config = load_config("solo8_waves", ["finetuning.env.terrain.noise=[0,0]"])
-    library = build_library(phase_config(config, FINETUNING).env.terrain)
+    library = build_library(phase_of(config, FINETUNING).config.env.terrain)
     ground = Ground(library, 1, torch.device("cpu"))
     ground.tile[:] = library.index(library.types.index("waves"), 9, 0)
     x = torch.tensor([0.6, 1.0, 1.4])  # trough, crest and trough of a wave 0.8 m long
@@ -170,10 +171,10 @@ def test_a_terrain_is_a_function_and_a_line():
 
 def test_a_part_of_the_learner_is_a_class_and_a_line():
     from kiras_rl.algorithms.kiras import KirasPPO
-    from kiras_rl.phases import SKILL_LEARNING, rsl_rl_config
+    from kiras_rl.phases import plan
 
     env, config = make_env("solo8_bounded")
-    settings = rsl_rl_config(config, SKILL_LEARNING, env.step_dt)
+    settings = plan(config)[0].learner_settings(env.step_dt)
     alg = KirasPPO.construct_algorithm(env.get_observations(), env, settings, "cpu")
     mean = torch.tensor([[5.0, -8.0], [0.0, 5.5]])
     loss = alg.parts["bounds"].policy_loss(mean, {})

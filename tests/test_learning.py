@@ -10,7 +10,7 @@ from kiras_rl.config import load_config
 from kiras_rl.deploy.policy import OnboardPolicy
 from kiras_rl.envs import make_env
 from kiras_rl.export import export_policy
-from kiras_rl.phases import SKILL_LEARNING
+from kiras_rl.phases import plan
 from kiras_rl.runner import KirasRunner
 from kiras_rl.tools.driver import Driver
 from kiras_rl.tools.evaluator import make_evaluators
@@ -26,10 +26,10 @@ def trained(tmp_path_factory):
     """The run, what it logged in each iteration, and its last evaluation."""
     schedule = ["iterations=260", f"evaluation.interval={ITERATIONS}"]
     overrides = [*schedule, "device=cpu", "num_envs=1024", "learner.estimator.adaboot=off"]
-    config = load_config("solo8_quick", overrides)
+    phase = plan(load_config("solo8_quick", overrides))[0]
     run = tmp_path_factory.mktemp("run")
-    evaluators = make_evaluators(config, SKILL_LEARNING, "cpu")
-    runner = KirasRunner(make_env(config), config, run, "cpu", evaluators)
+    evaluators = make_evaluators(phase, "cpu")
+    runner = KirasRunner(make_env(phase.config), phase, run, "cpu", evaluators)
     log = []
     runner.learn(ITERATIONS, on_iteration=lambda status: log.append(status.scalars))
     return run, log, runner.evaluation

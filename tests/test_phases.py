@@ -8,8 +8,8 @@ from kiras_rl.config import ConfigError, config_to_dict, load_config
 from kiras_rl.phases import (
     FINETUNING,
     SKILL_LEARNING,
-    phase_config,
-    phases_of,
+    phase_of,
+    plan,
     total_iterations,
 )
 
@@ -28,22 +28,25 @@ def changed(one, other, prefix=""):
 
 def test_the_paper_s_phases_are_the_default():
     config = load_config("solo8")
-    assert phases_of(config) == (SKILL_LEARNING, FINETUNING)
+    flat, rough = plan(config)
+    assert (flat.name, flat.first, flat.last, flat.retention) == (SKILL_LEARNING, 0, 6000, None)
+    assert (rough.name, rough.first, rough.last) == (FINETUNING, 6000, 36000)
+    assert rough.retention == config.finetuning.retention
+    assert flat.run is rough.run is config
     assert (config.num_envs, config.iterations) == (4096, 6000)
-    assert phase_config(config, FINETUNING).iterations == 30000
     assert total_iterations(config) == 36000
 
 
 def test_skill_learning_is_the_run_without_finetuning():
     config = load_config("solo8")
-    alone = phase_config(config, SKILL_LEARNING)
+    alone = phase_of(config, SKILL_LEARNING).config
     assert changed(config_to_dict(config), config_to_dict(alone)) == ["finetuning"]
     assert alone.env.terrain is None
 
 
 def test_finetuning_has_its_changes_and_no_imitation():
     overrides = ["finetuning.env.terrain.scale=1.5", "finetuning.sim.threads=7"]
-    alone = phase_config(load_config("solo8", overrides), FINETUNING)
+    alone = phase_of(load_config("solo8", overrides), FINETUNING).config
     assert alone.learner.imitation is None
     assert alone.learner.multi_critic is None
     assert alone.finetuning is None
@@ -65,7 +68,7 @@ def test_finetuning_has_its_changes_and_no_imitation():
 
 def test_the_paper_s_rewards_hold_in_both_phases():
     paper = load_config("paper")
-    flat, rough = (phase_config(paper, phase) for phase in (SKILL_LEARNING, FINETUNING))
+    flat, rough = (phase_of(paper, phase).config for phase in (SKILL_LEARNING, FINETUNING))
     for rewards in (flat.env.rewards, rough.env.rewards):
         rewards.terms = {name: values for name, values in rewards.terms.items() if values}
     assert rough.env.rewards == flat.env.rewards
@@ -74,7 +77,9 @@ def test_the_paper_s_rewards_hold_in_both_phases():
 
 def test_a_run_may_leave_finetuning_out():
     config = load_config("solo8_quick")
-    assert phases_of(config) == (SKILL_LEARNING,)
+    assert [phase.name for phase in plan(config)] == [SKILL_LEARNING]
+    with pytest.raises(ConfigError, match="finetuning=null: this run has no phase"):
+        phase_of(config, FINETUNING)
     assert total_iterations(config) == config.iterations
 
 
@@ -89,7 +94,7 @@ def test_a_run_may_leave_finetuning_out():
 def test_a_change_that_cannot_be_is_one_clear_line(override, message):
     config = load_config("solo8", [f"finetuning.{override}"])
     with pytest.raises(ConfigError) as caught:
-        phase_config(config, FINETUNING)
+        phase_of(config, FINETUNING)
     assert message in str(caught.value)
     assert str(caught.value).startswith("finetuning")
     assert "\n" not in str(caught.value)

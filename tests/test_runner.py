@@ -16,7 +16,7 @@ from tensorboard.summary.writer import event_file_writer
 from kiras_rl.checkpoint import CheckpointError, load_checkpoint, save_checkpoint
 from kiras_rl.config import list_configs, load_config
 from kiras_rl.envs import make_env
-from kiras_rl.phases import FINETUNING, SKILL_LEARNING, phase_config
+from kiras_rl.phases import FINETUNING, SKILL_LEARNING, phase_of, plan
 from kiras_rl.process import StopRequest
 from kiras_rl.runner import Evaluators, KirasRunner
 from kiras_rl.soundness import TrainingError
@@ -55,9 +55,9 @@ def make_runner(tmp_path):
 
     def make(run, *overrides, evaluate=None, phase=SKILL_LEARNING):
         config = load_config("solo8", [*TINY, *overrides])
-        env = make_env(phase_config(config, phase))
+        resolved = phase_of(config, phase)
         evaluators = Evaluators(flat=evaluate)
-        return KirasRunner(env, config, tmp_path / run, "cpu", evaluators, phase=phase)
+        return KirasRunner(make_env(resolved.config), resolved, tmp_path / run, "cpu", evaluators)
 
     return make
 
@@ -162,7 +162,7 @@ def test_a_checkpoint_of_another_phase_is_refused(make_runner):
 @pytest.mark.parametrize("cfg", [name for name in list_configs() if name.startswith("ablations/")])
 def test_every_ablation_trains_without_the_part_it_leaves_out(cfg):
     config, seen = load_config(cfg, ["num_envs=4", "iterations=2", "evaluation.interval=0"]), []
-    runner = KirasRunner(make_env(config), config, None, "cpu")
+    runner = KirasRunner(make_env(config), plan(config)[0], None, "cpu")
     runner.learn(on_iteration=lambda status: seen.append(status.scalars))
     for scalars in seen:
         assert all(math.isfinite(value) for value in scalars.values())
@@ -226,7 +226,7 @@ def test_evaluations_come_at_their_interval_and_at_the_end(make_runner, tell, in
 
 def test_without_a_folder_nothing_is_written(tmp_path):
     config = load_config("solo8", [*TINY, "iterations=1"])
-    KirasRunner(make_env(config), config, None, "cpu").learn()
+    KirasRunner(make_env(config), plan(config)[0], None, "cpu").learn()
     assert list(tmp_path.iterdir()) == []
 
 

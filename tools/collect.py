@@ -15,7 +15,7 @@ from kiras_rl.checkpoint import versions
 from kiras_rl.config import ConfigError
 from kiras_rl.dataset import FORMATS, Dataset, DatasetError, check_target, save_dataset
 from kiras_rl.deploy.policy import PolicyError, PolicyMetadata
-from kiras_rl.phases import FINETUNING, SKILL_LEARNING, phase_config
+from kiras_rl.phases import plan
 from kiras_rl.robots.robot import RobotError
 from kiras_rl.schema import Config
 from kiras_rl.tools.arguments import at_least, seconds_above
@@ -134,9 +134,10 @@ def _skills(text: str | None, metadata: PolicyMetadata) -> tuple[str, ...]:
 
 def _ground(whole: Config, text: str) -> tuple[Config, tuple[str, int] | None]:
     """Return the configuration of the phase that has the ground, and its type and level."""
+    phases = plan(whole)
     if text == "flat":
-        return phase_config(whole, SKILL_LEARNING), None
-    config = phase_config(whole, FINETUNING)
+        return phases[0].config, None
+    config = phases[-1].config
     if config.env.terrain is None:
         raise ConfigError("this policy's configuration has no terrain: finetuning=null in its run")
     if text.count(":") > 1:

@@ -21,7 +21,7 @@ from kiras_rl.evaluation.terrain import (
     rough_types,
 )
 from kiras_rl.interfaces import HISTORY, PROPRIO
-from kiras_rl.phases import FINETUNING, finetuning_terrain, phase_config
+from kiras_rl.phases import Phase, finetuning_terrain, plan
 from kiras_rl.robots.robot import Robot, load_robot
 from kiras_rl.runner import Evaluators
 from kiras_rl.schema import Config
@@ -90,7 +90,7 @@ def make_evaluation_env(
     return make_env(config, device, num_envs, robot)
 
 
-def make_evaluators(config: Config, phase: str, device: str) -> Evaluators:
+def make_evaluators(phase: Phase, device: str) -> Evaluators:
     """Return the evaluations that run beside a phase of a training.
 
     The one on flat ground is the same in both phases: it shows what finetuning forgets.
@@ -98,10 +98,13 @@ def make_evaluators(config: Config, phase: str, device: str) -> Evaluators:
     Raises:
         ConfigError: A duration that leaves nothing to count.
     """
-    if not config.evaluation.interval:
+    if not phase.config.evaluation.interval:
         return Evaluators()
-    terrain = _make_terrain_evaluator(config, device) if phase == FINETUNING else None
-    return Evaluators(flat=_make_flat_evaluator(config, device), terrain=terrain)
+    rough = phase.config if phase.config.env.terrain else None
+    return Evaluators(
+        flat=_make_flat_evaluator(plan(phase.run)[0].config, device),
+        terrain=_make_terrain_evaluator(rough, device) if rough else None,
+    )
 
 
 def _make_flat_evaluator(config: Config, device: str) -> Callable[[Policy], dict[str, SkillResult]]:
@@ -121,11 +124,11 @@ def _make_flat_evaluator(config: Config, device: str) -> Callable[[Policy], dict
 
 
 def _make_terrain_evaluator(config: Config, device: str) -> Callable[[Policy], TerrainResult]:
-    settings = config.evaluation.terrain
-    rough = phase_config(config, FINETUNING)
-    count = len(rough_types(build_library(finetuning_terrain(config)).types))
+    settings, terrain = config.evaluation.terrain, config.env.terrain
+    assert terrain is not None  # the caller looked
+    count = len(rough_types(build_library(terrain).types))
     num_envs = settings.robots * count * len(load_robot(config.robot).skills)
-    env = make_evaluation_env(rough, num_envs, TIME_LIMIT, device)
+    env = make_evaluation_env(config, num_envs, TIME_LIMIT, device)
 
     def evaluate(policy: Policy) -> TerrainResult:
         return evaluate_terrain(env, policy, settings.robots, settings.level, settings.command)

@@ -14,7 +14,7 @@ from kiras_rl.config import ConfigError, config_from_dict, list_configs, load_co
 from kiras_rl.deploy.policy import PolicyMetadata
 from kiras_rl.envs.terrain_geoms import add_tile
 from kiras_rl.envs.terrain_library import TerrainLibrary, build_library
-from kiras_rl.phases import FINETUNING, phase_config
+from kiras_rl.phases import plan
 from kiras_rl.schema import Config, TerrainConfig
 
 _ABOVE = 50.0  # m: higher than any tile
@@ -169,4 +169,4 @@ def _default(robot: str) -> TerrainConfig:
 
 
 def _terrain(config: Config) -> TerrainConfig | None:
-    return phase_config(config, FINETUNING).env.terrain
+    return plan(config)[-1].config.env.terrain

@@ -30,7 +30,7 @@ from kiras_rl.config import (
     read_keys,
 )
 from kiras_rl.ownership import owning
-from kiras_rl.phases import SKILL_LEARNING, total_iterations
+from kiras_rl.phases import plan, total_iterations
 from kiras_rl.process import StopRequest
 from kiras_rl.runner import KirasRunner
 from kiras_rl.schema import Config
@@ -317,7 +317,7 @@ def try_out(runs: list[Run]) -> None:
     for label, config in {run.label: run.config for run in runs}.items():
         try:
             check(config)
-            build(config, None, SKILL_LEARNING, num_envs=1)
+            build(plan(config)[0], None, num_envs=1)
         except MISTAKES as error:
             raise ConfigError(f"{label}: {error}") from None
 

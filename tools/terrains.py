@@ -18,7 +18,7 @@ from rich.table import Table
 from kiras_rl.config import ConfigError, load_config
 from kiras_rl.envs.model import build_scene
 from kiras_rl.envs.terrain_library import TerrainLibrary, build_library
-from kiras_rl.phases import FINETUNING, phase_config
+from kiras_rl.phases import plan
 from kiras_rl.robots.robot import Robot, RobotError, load_robot
 from kiras_rl.schema import Config
 from kiras_rl.tools.arguments import PICTURES, file_of
@@ -60,7 +60,7 @@ def _show(arguments: argparse.Namespace) -> None:
     if arguments.out:
         check_output(arguments.out, WRITER)
     whole = load_config(arguments.cfg, [f"robot={arguments.robot}", *arguments.overrides])
-    config = phase_config(whole, FINETUNING)
+    config = plan(whole)[-1].config
     robot = load_robot(config.robot)
     library = _library(config)
     path = arguments.out or Path("runs", "terrains", f"{robot.name}.png")

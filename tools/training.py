@@ -7,7 +7,7 @@ import re
 import shlex
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import torch
@@ -24,8 +24,9 @@ from kiras_rl.ownership import owning
 from kiras_rl.phases import (
     FINETUNING,
     SKILL_LEARNING,
-    phase_config,
-    phases_of,
+    Phase,
+    phase_of,
+    plan,
 )
 from kiras_rl.process import StopRequest
 from kiras_rl.robots.robot import RobotError
@@ -84,7 +85,7 @@ def begin(config: Config, flat: Path | None = None) -> KirasRunner:
     """
     content = distributed.from_main(lambda: read_flat(flat, config)) if flat else None
     check(config)
-    runner = build(config, None, FINETUNING if flat else SKILL_LEARNING)
+    runner = build(phase_of(config, FINETUNING if flat else SKILL_LEARNING), None)
     if flat and content:
         check_fit(flat, content, runner)
         runner.begin_from(flat)
@@ -116,7 +117,7 @@ def resume(source: Path, overrides: list[str], changed_robot: bool = False) -> K
         )
     if phase == SKILL_LEARNING:
         check(config)
-    runner = build(config, run_dir, phase)
+    runner = build(phase_of(config, phase), run_dir)
     runner.takes_changed_robot = changed_robot
     runner.load(str(source))
     return runner
@@ -136,11 +137,12 @@ def check(config: Config) -> None:
     if config.finetuning is None:
         return
     check_terrain(config)
-    alone = phase_config(config, FINETUNING)
-    resolve_backend(alone.sim.backend, torch.device(resolve_device(config.device)))
-    before = networks_of(config, SKILL_LEARNING)
+    skill_learning, finetuning = plan(config)
+    backend = finetuning.config.sim.backend
+    resolve_backend(backend, torch.device(resolve_device(config.device)))
+    before = networks_of(skill_learning)
     try:
-        after = networks_of(config, FINETUNING)
+        after = networks_of(finetuning)
     except (ConfigError, PolicyError) as error:
         raise ConfigError(f"finetuning: {error}") from None
     for name, shapes in before.items():
@@ -151,13 +153,11 @@ def check(config: Config) -> None:
             )
 
 
-def networks_of(config: Config, phase: str) -> dict[str, list[tuple[int, ...]]]:
+def networks_of(phase: Phase) -> dict[str, list[tuple[int, ...]]]:
     """Return the shapes of the weights of a phase's networks; it is tried out with one world."""
-    trial = copy.deepcopy(config)
-    trial.device, trial.sim.backend = "cpu", "auto"
-    if trial.finetuning:
-        trial.finetuning.sim |= {"backend": "auto"}
-    return sizes(build(trial, None, phase, num_envs=1).alg.networks())
+    trial = copy.deepcopy(phase.config)
+    trial.device, trial.sim.backend, trial.evaluation.interval = "cpu", "auto", 0
+    return sizes(build(replace(phase, config=trial), None, num_envs=1).alg.networks())
 
 
 def run_of(source: Path) -> Path:
@@ -173,28 +173,25 @@ def run_of(source: Path) -> Path:
     return source.absolute().parent.parent
 
 
-def build(
-    config: Config, run_dir: Path | None, phase: str, num_envs: int | None = None
-) -> KirasRunner:
+def build(phase: Phase, run_dir: Path | None, num_envs: int | None = None) -> KirasRunner:
     """Build the learner of a phase with its environment and evaluations.
 
     Args:
-        config: The run.
-        run_dir: Its folder.
-        phase: Which phase.
+        phase: The phase.
+        run_dir: Folder of the run.
         num_envs: Worlds, if not the configuration's.
 
     Raises:
         ConfigError: What the phase could not use.
         PolicyError: A policy that could not be exported.
     """
-    device = resolve_device(config.device)
-    alone = phase_config(config, phase)
+    device = resolve_device(phase.config.device)
+    alone = copy.deepcopy(phase.config)
     alone.seed += distributed.rank()  # every rank has worlds of its own, and its share of the cores
     alone.sim.threads = alone.sim.threads or distributed.core_share()
     env = make_env(alone, device, num_envs, progress=0.0)
-    evaluators = make_evaluators(config, phase, device)
-    runner = KirasRunner(env, config, run_dir, device, evaluators, source_commit(), phase)
+    evaluators = make_evaluators(phase, device)
+    runner = KirasRunner(env, phase, run_dir, device, evaluators, source_commit())
     # What could not be exported is refused now, not after hours of training.
     PolicyMetadata.from_dict(runner.describe_policy())
     return runner
@@ -262,9 +259,10 @@ def _train_owned(runner: KirasRunner, stop: StopRequest) -> bool:
     _announce(runner)
     with Progress(console) as progress:
         finished = runner.learn(on_iteration=progress.show, stop=stop)
-        if finished and runner.phase == SKILL_LEARNING and runner.config.finetuning:
-            runner = _next_phase(runner)
-            finished = runner.learn(on_iteration=progress.show, stop=stop)
+        for phase in plan(runner.config):
+            if finished and phase.first >= runner.phase.last:
+                runner = _next_phase(runner, phase)
+                finished = runner.learn(on_iteration=progress.show, stop=stop)
     if finished:
         distributed.from_main(lambda: _conclude(runner))
     return finished
@@ -306,14 +304,14 @@ def is_finished(run_dir: Path, iterations: int) -> bool:
     return checkpoint.load_checkpoint(latest)["iteration"] == iterations
 
 
-def _next_phase(before: KirasRunner) -> KirasRunner:
-    """Return the learner of terrain finetuning, which begins where skill learning ended.
+def _next_phase(before: KirasRunner, phase: Phase) -> KirasRunner:
+    """Return the learner of a phase, which begins where the one before ended.
 
     The best policy of skill learning stays in the run under a name of its own.
     """
     assert before.run_dir is not None
     folder = before.run_dir / checkpoint.FOLDER
-    runner = build(before.config, before.run_dir, FINETUNING)
+    runner = build(phase, before.run_dir)
     runner.begin_from(folder / checkpoint.LATEST)
     distributed.from_main(lambda: _keep_flat(folder))
     runner.save_latest()  # from here on the run goes on in this phase
@@ -329,8 +327,8 @@ def _keep_flat(folder: Path) -> None:
 def _announce(runner: KirasRunner) -> None:
     config = runner.config
     backend = resolve_backend(config.sim.backend, torch.device(runner.device))
-    phases = (FINETUNING,) if runner.begun_from else phases_of(config)
-    lengths = [phase_config(config, phase).iterations for phase in phases]
+    phases = [runner.phase] if runner.begun_from else plan(config)
+    lengths = [phase.config.iterations for phase in phases]
     ranks = distributed.size()
     steps = ranks * config.num_envs * config.learner.ppo.num_steps * sum(lengths)
     worlds = f"{config.num_envs} worlds" if ranks == 1 else f"{ranks} x {config.num_envs} worlds"

@@ -9,7 +9,7 @@ from tensordict import TensorDict
 from kiras_rl import interfaces as names
 from kiras_rl.config import load_config
 from kiras_rl.interfaces import SkillEnv
-from kiras_rl.phases import SKILL_LEARNING
+from kiras_rl.phases import SKILL_LEARNING, phase_of
 from kiras_rl.runner import KirasRunner
 
 SMALL = (
@@ -105,6 +105,6 @@ def make_runner():
     def make(*overrides, num_envs=16, phase=SKILL_LEARNING):
         torch.manual_seed(1)
         config = load_config("base", [*SMALL, *overrides])
-        return KirasRunner(CountingEnv(num_envs), config, None, "cpu", phase=phase)
+        return KirasRunner(CountingEnv(num_envs), phase_of(config, phase), None, "cpu")
 
     return make

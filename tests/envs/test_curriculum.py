@@ -13,14 +13,14 @@ from kiras_rl.envs.curriculum import COLUMNS, Curriculum
 from kiras_rl.envs.randomness import UniformBuffer
 from kiras_rl.envs.state import Task
 from kiras_rl.envs.terrain_library import build_library
-from kiras_rl.phases import FINETUNING, phase_config
+from kiras_rl.phases import FINETUNING, phase_of
 
 WORLDS, SKILLS = 10, 3
 
 
 @pytest.fixture(scope="module")
 def library():
-    config = phase_config(load_config("base"), FINETUNING).env.terrain
+    config = phase_of(load_config("base"), FINETUNING).config.env.terrain
     return build_library(dataclasses.replace(config, levels=3, variants=2))
 
 

@@ -9,6 +9,7 @@ from kiras_rl.config import ConfigError, load_config
 from kiras_rl.envs import observations
 from kiras_rl.envs.observations import View
 from kiras_rl.interfaces import COMMAND, CRITIC, HISTORY, IMITATION, NEXT_PROPRIO, PROPRIO
+from kiras_rl.phases import plan
 from kiras_rl.runner import KirasRunner
 
 FIXED_TASK = (
@@ -63,7 +64,7 @@ def test_widths_are_those_of_the_preset(build_env, cfg, proprio, critic, imitati
     }  # fmt: skip
     assert env.keyframe_features.shape == (5, imitation)
     assert env.keyframe_observations().shape == (5, 3, critic)
-    alg = KirasRunner(env, load_config(cfg), None, "cpu").alg
+    alg = KirasRunner(env, plan(load_config(cfg))[0], None, "cpu").alg
     assert widths(alg.actor.mlp) == (actor, 8)
     assert widths(alg.parts["estimator"].estimator.encoder) == (4 * proprio, 3 + 2 * 8)
     assert widths(alg.parts["estimator"].estimator.decoder) == (8 + 5, proprio)

@@ -11,7 +11,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from kiras_rl.config import load_config
 from kiras_rl.envs import make_env
-from kiras_rl.phases import FINETUNING, SKILL_LEARNING, phase_config
+from kiras_rl.phases import FINETUNING, SKILL_LEARNING, phase_of
 
 LIMITS = {SKILL_LEARNING: 575, FINETUNING: 1110}
 """Operations of a step at most: those of today, and a few for terms to come."""
@@ -65,7 +65,7 @@ def phase(request):
     """A phase, and its environment on the warp backend after a first step, every part in it."""
     overrides = ("num_envs=4", "finetuning.env.terrain={levels: 2, variants: 1}")
     config = load_config("solo8", [*overrides, "sim.backend=warp", "device=cpu"])
-    env = make_env(phase_config(config, request.param))
+    env = make_env(phase_of(config, request.param).config)
     env.step(torch.zeros(4, env.num_actions))
     return request.param, env
 

@@ -5,7 +5,7 @@ import torch
 
 from kiras_rl.config import load_config
 from kiras_rl.envs import make_env
-from kiras_rl.phases import FINETUNING, SKILL_LEARNING, phase_config
+from kiras_rl.phases import FINETUNING, SKILL_LEARNING, phase_of
 from kiras_rl.recorded import Recorded
 
 
@@ -13,7 +13,7 @@ def build(cfg, phase, device):
     small = ("num_envs=6", "env.terminations.episode_length=0.3", "sim.backend=warp")
     terrain = "finetuning.env.terrain={levels: 2, variants: 1}"
     config = load_config(cfg, [*small, terrain, f"device={device}"])
-    return make_env(phase_config(config, phase), device)
+    return make_env(phase_of(config, phase).config, device)
 
 
 def assert_same(one, other):

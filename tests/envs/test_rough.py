@@ -11,7 +11,7 @@ from kiras_rl.config import load_config
 from kiras_rl.envs import make_env
 from kiras_rl.envs.terrains import CROSSED
 from kiras_rl.evaluation.terrain import Trials, evaluate_terrain, run_trials
-from kiras_rl.phases import FINETUNING, phase_config
+from kiras_rl.phases import FINETUNING, phase_of
 
 CALM = (
     "num_envs=8",
@@ -32,7 +32,7 @@ def build():
 
     def make(*overrides):
         config = load_config("solo8", [*CALM, *overrides])
-        return make_env(phase_config(config, FINETUNING))
+        return make_env(phase_of(config, FINETUNING).config)
 
     return make
 

@@ -7,6 +7,7 @@ import torch
 
 from kiras_rl.config import ConfigError, load_config
 from kiras_rl.envs import observations, rewards
+from kiras_rl.phases import plan
 from kiras_rl.runner import KirasRunner
 from kiras_rl.soundness import TrainingError
 
@@ -64,7 +65,7 @@ def test_a_term_without_a_number_is_named(where, monkeypatch):
     add(monkeypatch, module, "broken", broken, first)
     entry = "{weight: 1}" if "rewards" in where else "{}"
     config = load_config("smoke", ["num_envs=4", "device=cpu", f"{where}.broken={entry}"])
-    runner = KirasRunner(make_env(config), config, None, "cpu")
+    runner = KirasRunner(make_env(config), plan(config)[0], None, "cpu")
     with pytest.raises(
         TrainingError, match=r"not finite: (Reward/|env\.observations\.critic\.)broken"
     ):

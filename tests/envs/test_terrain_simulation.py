@@ -13,7 +13,7 @@ from kiras_rl.envs.ground import Ground
 from kiras_rl.envs.simulation.native import NativeSimulation
 from kiras_rl.envs.terrain_geoms import add_terrain, terrain_geoms
 from kiras_rl.envs.terrain_library import build_library
-from kiras_rl.phases import FINETUNING, phase_config
+from kiras_rl.phases import FINETUNING, phase_of
 
 BACKENDS = ["native", "warp", pytest.param("cuda", marks=pytest.mark.gpu)]
 ALL = (0, 1, 2, 3)
@@ -23,7 +23,7 @@ SPACIOUS = {"max_contacts": 64, "max_constraints": 256, "max_ccd": 16}
 @pytest.fixture(scope="session")
 def library():
     """A gentle and a hard level, both directions, all types."""
-    config = phase_config(load_config("base"), FINETUNING).env.terrain
+    config = phase_of(load_config("base"), FINETUNING).config.env.terrain
     return build_library(dataclasses.replace(config, levels=2, variants=2))
 
 

@@ -13,9 +13,9 @@ from kiras_rl.envs.ground import Ground
 from kiras_rl.envs.terrain_geoms import add_terrain, terrain_geoms
 from kiras_rl.envs.terrain_library import build_library
 from kiras_rl.envs.terrains import Draw
-from kiras_rl.phases import FINETUNING, phase_config
+from kiras_rl.phases import FINETUNING, phase_of
 
-CONFIG = phase_config(load_config("base"), FINETUNING).env.terrain
+CONFIG = phase_of(load_config("base"), FINETUNING).config.env.terrain
 LEVELS = range(CONFIG.levels)
 
 
@@ -314,4 +314,4 @@ def refusal(config):
 def test_sizes_are_positive(key):
     config = load_config("base", [f"finetuning.env.terrain.{key}=0"])
     with pytest.raises(ConfigError, match=f"env.terrain.{key}=0.*: must be positive"):
-        phase_config(config, FINETUNING)
+        phase_of(config, FINETUNING)

@@ -7,14 +7,14 @@ from dataclasses import replace
 import pytest
 
 from kiras_rl.config import load_config
-from kiras_rl.phases import FINETUNING, phase_config
+from kiras_rl.phases import FINETUNING, phase_of
 from kiras_rl.tools.ground import Terrain
 
 
 @pytest.fixture(scope="session")
 def terrain():
     """Return the tiles of configuration base."""
-    return Terrain(phase_config(load_config("base"), FINETUNING).env.terrain)
+    return Terrain(phase_of(load_config("base"), FINETUNING).config.env.terrain)
 
 
 @pytest.fixture(scope="session")

@@ -22,7 +22,7 @@ from kiras_rl.deploy.metadata import METADATA_KEY
 from kiras_rl.deploy.policy import OnboardPolicy
 from kiras_rl.envs import observations
 from kiras_rl.export import export_policy
-from kiras_rl.phases import FINETUNING, SKILL_LEARNING, phase_config
+from kiras_rl.phases import FINETUNING, SKILL_LEARNING, phase_of
 from kiras_rl.robots.robot import load_robot
 from kiras_rl.tools.collect import main
 from kiras_rl.tools.collector import Plan, collect
@@ -41,7 +41,7 @@ def make_env():
 
     def make(num_envs, nominal=True, duration=2.0, *overrides, phase=SKILL_LEARNING):
         config = load_config("smoke", ["sim.backend=native", *overrides])
-        config = phase_config(config, phase)
+        config = phase_of(config, phase).config
         return make_evaluation_env(evaluation_physics(config, nominal), num_envs, duration)
 
     return make

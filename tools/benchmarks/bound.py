@@ -20,7 +20,7 @@ from rich.table import Table
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils.flop_counter import flop_registry
 
-from kiras_rl.phases import SKILL_LEARNING
+from kiras_rl.phases import plan
 from kiras_rl.process import single_threaded
 from kiras_rl.schema import LearnerConfig
 from kiras_rl.tools.benchmarks.request import Figures, Request, native
@@ -85,7 +85,7 @@ def measure(request: Request) -> Figures:
         RobotError: As `make_env`.
     """
     config = native(request.config)
-    training = Training(config, "cpu", SKILL_LEARNING)
+    training = Training(plan(config)[0], "cpu")
     targets = training.record_targets()
     operations = count_operations(training)
     shapes = _shapes(config.learner, config.num_envs)

@@ -19,7 +19,7 @@ from kiras_rl.config import ConfigError
 from kiras_rl.envs.model import Scene, build_scene
 from kiras_rl.envs.terrain_library import TerrainLibrary, build_library
 from kiras_rl.envs.terrains import HALF
-from kiras_rl.phases import FINETUNING, finetuning_terrain, phase_config
+from kiras_rl.phases import FINETUNING, finetuning_terrain, phase_of
 from kiras_rl.robots.robot import Robot, load_robot
 from kiras_rl.tools.benchmarks.request import Figures, Request
 from kiras_rl.tools.benchmarks.tables import make_table
@@ -61,7 +61,7 @@ def measure(request: Request) -> Figures:
     """
     if request.config.finetuning is None:
         raise ConfigError("finetuning=null: this configuration has no terrain to measure")
-    config = phase_config(request.config, FINETUNING)
+    config = phase_of(request.config, FINETUNING).config
     robot, library = load_robot(config.robot), build_library(finetuning_terrain(request.config))
     if not (library.grid > 0).any():
         raise ConfigError(

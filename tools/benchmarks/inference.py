@@ -11,6 +11,7 @@ from rich.table import Table
 
 from kiras_rl.deploy.policy import OnboardPolicy
 from kiras_rl.envs import make_env
+from kiras_rl.phases import plan
 from kiras_rl.runner import KirasRunner
 from kiras_rl.schema import Config
 from kiras_rl.tools.benchmarks.request import Figures, Request, native
@@ -48,7 +49,7 @@ def _export(config: Config) -> OnboardPolicy:
     """Take the way of every trained policy: runner, checkpoint, ONNX file."""
     with TemporaryDirectory() as folder:
         run = Path(folder)
-        KirasRunner(make_env(config), config, run, "cpu").save_latest()
+        KirasRunner(make_env(config), plan(config)[0], run, "cpu").save_latest()
         report = export_checkpoint(find_checkpoint(run), run / "policy.onnx")
         return OnboardPolicy(report.path)
 

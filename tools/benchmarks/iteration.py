@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from rich.table import Table
 
-from kiras_rl.phases import phases_of
+from kiras_rl.phases import Phase, plan
 from kiras_rl.recorded import WARM_UP
 from kiras_rl.tools.benchmarks.request import Figures, Request
 from kiras_rl.tools.benchmarks.tables import make_table
@@ -53,7 +53,7 @@ def measure(request: Request) -> Figures:
         ConfigError: As `make_env`.
         RobotError: As `make_env`.
     """
-    phases = {phase: _time_parts(request, phase) for phase in phases_of(request.config)}
+    phases = {phase.name: _time_parts(request, phase) for phase in plan(request.config)}
     return {
         "worlds": request.config.num_envs,
         "num_steps": request.config.learner.ppo.num_steps,
@@ -66,9 +66,9 @@ def measure(request: Request) -> Figures:
     }
 
 
-def _time_parts(request: Request, phase: str) -> Times:
+def _time_parts(request: Request, phase: Phase) -> Times:
     """Return the seconds of each part of an iteration, one a round."""
-    training = Training(request.config, request.device, phase)
+    training = Training(phase, request.device)
     for _ in range(WARM_UP + 1):  # on a GPU graphs are recorded, which waits for nothing
         training.iterate()
     timer = PartTimer(request.device)

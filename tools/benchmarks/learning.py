@@ -21,6 +21,7 @@ from kiras_rl import interfaces as names
 from kiras_rl.envs import make_env
 from kiras_rl.envs.quadruped import QuadrupedEnv
 from kiras_rl.models.actor import start_near_zero
+from kiras_rl.phases import plan
 from kiras_rl.process import single_threaded
 from kiras_rl.runner import KirasRunner
 from kiras_rl.schema import Config, LearnerConfig
@@ -77,8 +78,8 @@ def measure(request: Request) -> Figures:
     bench.add(STOCK, lambda: _make_stock(env, config, device), _iterate_stock)
     bench.add(STOCK_SINGLE, lambda: _make_stock(env, config, device), _iterate_stock_single)
     for name, learner in _learners(config.learner).items():
-        variant = replace(config, learner=learner)
-        bench.add(name, lambda v=variant: KirasRunner(env, v, None, device), lambda r: r._iterate())
+        phase = plan(replace(config, learner=learner))[0]
+        bench.add(name, lambda p=phase: KirasRunner(env, p, None, device), lambda r: r._iterate())
     times, updates = bench.measure(request.rounds)
     stock = min(STOCK, STOCK_SINGLE, key=lambda name: median(times[name]))
     return {

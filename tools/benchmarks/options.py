@@ -23,7 +23,7 @@ from kiras_rl.config import ConfigError
 from kiras_rl.envs import rotations
 from kiras_rl.envs.model import Scene, build_scene
 from kiras_rl.evaluation.flat import walk
-from kiras_rl.phases import SKILL_LEARNING, phase_config
+from kiras_rl.phases import plan
 from kiras_rl.process import single_threaded
 from kiras_rl.robots.robot import Robot, load_robot
 from kiras_rl.schema import Config
@@ -147,7 +147,7 @@ def record_motions(config: Config) -> Motions:
         PolicyError: No policy comes with the robot.
     """
     policy = load_policy(None, config.robot)
-    trained = phase_config(trained_config(policy.metadata), SKILL_LEARNING)
+    trained = plan(trained_config(policy.metadata))[0].config
     trained = replace(evaluation_physics(native(trained), nominal=True), sim=config.sim)
     env = make_evaluation_env(trained, config.num_envs, SETTLE + max(TIMES))
     worlds = torch.arange(env.num_envs)

@@ -23,7 +23,7 @@ from matplotlib.ticker import NullFormatter, ScalarFormatter
 from rich.table import Table
 
 from kiras_rl.envs import make_env, resolve_backend
-from kiras_rl.phases import FINETUNING, SKILL_LEARNING, phase_config
+from kiras_rl.phases import plan
 from kiras_rl.process import single_threaded
 from kiras_rl.robots.robot import Robot, load_robot
 from kiras_rl.schema import Config
@@ -49,7 +49,7 @@ def measure(request: Request) -> Figures:
         ConfigError: As `make_env`.
         RobotError: As `make_env`.
     """
-    flat = phase_config(request.config, SKILL_LEARNING)
+    flat = plan(request.config)[0].config
     sizes, stopped = _grow(request, flat)
     return {
         "device": request.device,
@@ -101,18 +101,16 @@ def _is_memory(error: Exception) -> bool:
 
 def _variants(config: Config) -> dict[str, tuple[Config, int | None]]:
     """Return configurations with more and less in them, and the skills of the robot."""
-    phases = {FLAT: phase_config(config, SKILL_LEARNING)}
-    if config.finetuning:
-        phases[ROUGH] = phase_config(config, FINETUNING)
     variants: dict[str, tuple[Config, int | None]] = {}
-    for ground, alone in phases.items():
+    for ground, phase in zip((FLAT, ROUGH), plan(config), strict=False):
+        alone = phase.config
         variants[ground] = alone, None
         if alone.env.observations.critic.get("height_scan") is not None:
             blind = copy.deepcopy(alone)
             blind.env.observations.critic["height_scan"] = None
             variants[f"{ground}, {WITHOUT_SCAN}"] = blind, None
     for count in SKILLS:
-        variants[f"{FLAT}, {count} skill{'s' if count > 1 else ''}"] = phases[FLAT], count
+        variants[f"{FLAT}, {count} skill{'s' if count > 1 else ''}"] = variants[FLAT][0], count
     return variants
 
 

@@ -6,7 +6,7 @@ from rich.table import Table
 
 from kiras_rl.config import ConfigError
 from kiras_rl.envs import make_env
-from kiras_rl.phases import FINETUNING, SKILL_LEARNING, phase_config
+from kiras_rl.phases import plan
 from kiras_rl.process import single_threaded
 from kiras_rl.tools.benchmarks.physics import ENVIRONMENT
 from kiras_rl.tools.benchmarks.request import Figures, Request, native
@@ -34,7 +34,7 @@ def measure(request: Request) -> Figures:
     with single_threaded("cpu"):
         flat, rough = (
             Workload(make_env(alone), alone.sim, alone.learner.ppo.num_steps, alone.seed)
-            for alone in (phase_config(config, phase) for phase in (SKILL_LEARNING, FINETUNING))
+            for alone in (phase.config for phase in plan(config))
         )
         variants = {
             ENVIRONMENT: flat.environment(),

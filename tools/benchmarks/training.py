@@ -9,10 +9,10 @@ from dataclasses import replace
 import torch
 
 from kiras_rl.envs import make_env
-from kiras_rl.phases import phase_config
+from kiras_rl.phases import Phase
 from kiras_rl.process import single_threaded
 from kiras_rl.runner import KirasRunner
-from kiras_rl.schema import Config, LearnerConfig
+from kiras_rl.schema import LearnerConfig
 from kiras_rl.tools.benchmarks.workload import Workload
 from kiras_rl.tools.timing import wait_for
 
@@ -40,20 +40,20 @@ class Training:
         state: Of the environment, where every iteration begins.
     """
 
-    def __init__(self, config: Config, device: str, phase: str) -> None:
+    def __init__(self, phase: Phase, device: str) -> None:
         """Build both.
 
         Raises:
             ConfigError: As `make_env`.
             RobotError: As `make_env`.
         """
-        config = replace(config, learner=ungated(config.learner))
-        self.config, self._device = phase_config(config, phase), device
+        self.config = replace(phase.config, learner=ungated(phase.config.learner))
+        phase, self._device = replace(phase, config=self.config), device
         self.env = make_env(self.config, device)
         with single_threaded(device):
             work = Workload(self.env, self.config.sim, self.config.learner.ppo.num_steps, 0)
         self.state = work.state
-        self.runner = KirasRunner(self.env, config, None, device, phase=phase)
+        self.runner = KirasRunner(self.env, phase, None, device)
 
     def iterate(self) -> float:
         """Run one iteration and return its seconds."""

@@ -20,7 +20,7 @@ from kiras_rl.deploy.policy import OnboardPolicy, PolicyMetadata
 from kiras_rl.envs import resolve_backend
 from kiras_rl.envs.quadruped import QuadrupedEnv
 from kiras_rl.evaluation.flat import Policy
-from kiras_rl.phases import FINETUNING, SKILL_LEARNING, phase_config
+from kiras_rl.phases import plan
 from kiras_rl.robots.robot import Robot
 from kiras_rl.schema import Config, TerrainConfig
 from kiras_rl.tools.evaluator import (
@@ -179,11 +179,11 @@ class Subject:
 
     def flat(self) -> Config:
         """Return the configuration of flat ground."""
-        return self._physics(phase_config(self.run, SKILL_LEARNING))
+        return self._physics(plan(self.run)[0].config)
 
     def rough(self) -> Config:
         """Return the configuration of the robot's standard terrain."""
-        standard = phase_config(standard_config(self.run.robot), FINETUNING)
+        standard = plan(standard_config(self.run.robot))[-1].config
         config = self.flat()
         config.env.terrain = standard.env.terrain
         for capacity in ("max_contacts", "max_constraints", "max_ccd"):
