@@ -162,9 +162,13 @@ def low_swing(step: Step, factor: float) -> torch.Tensor:
 
 
 @remembering(air_time, descent)
-def hard_landing(step: Step) -> torch.Tensor:
-    """Return the sum of squared speeds at which the feet that land came down, (m/s)^2."""
-    return (step.memory[descent].square() * _landing(step)).sum(-1) * ~step.stands
+def hard_landing(step: Step, most: float) -> torch.Tensor:
+    """Return the sum over feet that land of the square of what they came down faster than `most`.
+
+    In (m/s)^2. A price from 0 m/s on would pay for low steps.
+    """
+    excess = (step.memory[descent] - most).clamp(min=0.0)
+    return (excess.square() * _landing(step)).sum(-1) * ~step.stands
 
 
 @remembering(stance_time, air_time)

@@ -104,7 +104,7 @@ EXPECTED = {
     "short_swing": ({"least": 0.16}, 0.04 / 0.16),
     "short_stance": ({"least": 0.2}, 0.5),  # of the foot that lifts off now
     "low_swing": ({"factor": 1.5}, (1 - 0.03 / 0.06) ** 2),  # crawl's clearance is 4 cm
-    "hard_landing": ({}, 0.8**2),  # of the foot that stands now
+    "hard_landing": ({"most": 0.5}, 0.3**2),  # of the foot that stands now
     "idle_feet": ({"most": 0.11}, 2.0),  # both have been in the air for longer
     "flight": ({"feet": 2}, 1.0),
     "joint_limits": ({"margin": 0.1}, (0.7 - 0.5) + (1.7 - 1.4)),  # the targets are just inside
