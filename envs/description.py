@@ -41,4 +41,5 @@ def describe_deployment(
         },
         "control_rate": 1.0 / step_dt,
         "command_range": {name: list(getattr(config.commands, name)) for name in commands},
+        "onboard": robot.onboard,
     }

@@ -79,6 +79,23 @@ def export_policy(
     return ExportReport(path, len(data), difference, check_inputs)
 
 
+def describe_again(source: Path, metadata: PolicyMetadata, path: Path) -> None:
+    """Write a policy file with the same networks and another description.
+
+    Args:
+        source: The policy file.
+        metadata: The description.
+        path: File to write; it may be the same.
+    """
+    import onnx
+
+    model = onnx.load(source)
+    (entry,) = [entry for entry in model.metadata_props if entry.key == METADATA_KEY]
+    entry.value = metadata.to_json()
+    with replacing(path) as temporary:
+        temporary.write_bytes(model.SerializeToString())
+
+
 def _check_widths(policy: nn.Module, metadata: PolicyMetadata) -> None:
     sizes = f"proprio {metadata.frame_size}, history {metadata.history_size}"
     try:

@@ -10,6 +10,7 @@ import mujoco
 import numpy as np
 
 from kiras_rl.robots.keyframes import Keyframe, KeyframeReader
+from kiras_rl.robots.onboard import read_onboard
 from kiras_rl.robots.reading import (
     RobotError,
     check_keys,
@@ -44,7 +45,7 @@ _KEYS = (
     "kd",
     "torque_limit",
 )
-_OPTIONAL_KEYS = ("joint_limits", "velocity_limit", "motor", "clearance", "variants")
+_OPTIONAL_KEYS = ("joint_limits", "velocity_limit", "motor", "clearance", "onboard", "variants")
 _MOTOR_KEYS = ("stall_torque", "no_load_speed")
 _CLEARANCE_SHARE = 1 / 3  # of the base height: more than that no step has to clear
 _USUAL_CLEARANCE = 0.3  # of the first keyframe's base height, where robot.yaml gives none
@@ -103,6 +104,8 @@ class Robot:
     """Height that feet should clear in a step in m; less where the base is low."""
     keyframes: tuple[Keyframe, ...]
     """One a skill, in the order of keyframes.yaml."""
+    onboard: dict[str, Any] | None
+    """What kiras-robot needs, as in `kiras_rl.robots.onboard`; None if robot.yaml does not say."""
     folder: Path = field(repr=False)
     """Where robot.yaml, keyframes.yaml and the MJCF lie."""
 
@@ -211,6 +214,7 @@ def load_robot(name: str, root: Path = ROBOTS) -> Robot:
         motor=_motor(entries.get("motor"), joints, where),
         foot_radius=_foot_radius(model, parts["foot_geoms"]),
         keyframes=keyframes,
+        onboard=read_onboard(entries.get("onboard"), where),
         folder=folder,
         **parts,
     )

@@ -149,6 +149,7 @@ def make_metadata():
             },
             "version": "0.1.0",
             "provenance": {"seed": 1},
+            "onboard": robot.onboard,
         }
         return PolicyMetadata.from_dict(values | changes)
 

@@ -43,7 +43,7 @@ class Rig:
         world: Callable[[Rig], Link] | None = None,
     ) -> None:
         self.policy = OnboardPolicy(shipped(robot))
-        self.profile = profile_of(robot)
+        self.profile = profile_of(self.policy.metadata)
         self.plant = Plant(self.policy.metadata, self.profile, seed)
         self.channel = Channel(robot, folder)
         self.channel.runtime.take()

@@ -50,6 +50,7 @@ RULES = {  # the longest name that fits a module counts
     "kiras_rl.dataset": Rule(("numpy", "kiras_rl.lerobot")),
     "kiras_rl.lerobot": Rule(("numpy", "pyarrow", "kiras_rl.dataset")),
     "kiras_rl.deploy": Rule(("numpy", "onnxruntime", "kiras_rl.deploy")),
+    "kiras_rl.deploy.runtime.profiles": Rule(("kiras_rl.deploy", "kiras_rl.robots.robot")),
     "kiras_rl.deploy.runtime.simulated": Rule(
         ("numpy", "mujoco", "kiras_rl.deploy", "kiras_rl.robots")
     ),

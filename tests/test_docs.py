@@ -14,11 +14,13 @@ from pathlib import Path
 
 import mujoco
 import pytest
+import yaml
 
 from kiras_rl.config import list_configs, load_config
 from kiras_rl.envs import rewards
 from kiras_rl.envs.state import Step
 from kiras_rl.phases import FINETUNING, phase_of
+from kiras_rl.robots.onboard import KEYS, read_onboard
 from kiras_rl.robots.robot import load_robot
 from kiras_rl.tools.curves import read_scalars
 from kiras_rl.tools.sweep import load_sweep
@@ -254,6 +256,12 @@ class SimulatedRobot:
         self.data.ctrl[:] = target
         mujoco.mj_step(self.model, self.data, 4)
         self.steps += 1
+
+
+def test_the_block_onboard_is_whole():
+    texts = blocks(TEXTS[ROOT / "docs" / "extending.md"], "yaml")
+    (block,) = [text for text in texts if text.startswith("onboard:")]
+    assert set(read_onboard(yaml.safe_load(block)["onboard"], "extending.md")) == set(KEYS)
 
 
 @pytest.mark.parametrize("page", ["README.md", "docs/deploy.md"])

@@ -12,6 +12,7 @@ import numpy as np
 from rich.table import Table
 
 from kiras_rl.deploy.policy import OnboardPolicy, PolicyError, PolicyMetadata
+from kiras_rl.robots.robot import RobotError
 from kiras_rl.tools import policy_files
 from kiras_rl.tools.console import make_console
 from kiras_rl.tools.ending import finish
@@ -24,12 +25,15 @@ on 1,000 random inputs before it is written.
 
   RUN          a run folder: checkpoints/best.pt, else checkpoints/latest.pt -> RUN/policy.onnx
   CHECKPOINT   a .pt file of a run -> the same name with .onnx beside it
+  ONNX         a policy file -> --out, the same with the block `onboard` of today's robot.yaml: what
+               kiras-robot checks, which a file of before lacks
 """
 
 _EXAMPLES = """\
 examples:
   kiras-export runs/solo8/2026-01-01_12-00-00
   kiras-export runs/solo8/2026-01-01_12-00-00/checkpoints/latest.pt --out policy.onnx
+  kiras-export old.onnx --out new.onnx      after a change of robots/<robot>/robot.yaml: onboard
 
 then, on the robot (numpy and onnxruntime are all it needs):
   policy = kiras_rl.deploy.policy.OnboardPolicy("policy.onnx")
@@ -46,15 +50,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
         epilog=_EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("source", type=Path, metavar="RUN|CHECKPOINT", help="what to export")
+    parser.add_argument("source", type=Path, metavar="RUN|CHECKPOINT|ONNX", help="as above")
     parser.add_argument("--out", type=Path, metavar="FILE", help="file to write")
     options = parser.parse_args(arguments)
-    return finish(lambda: _export(options.source, options.out), (PolicyError,))
+    return finish(lambda: _export(options.source, options.out), (PolicyError, RobotError))
 
 
 def _export(source: Path, out: Path | None) -> None:
     if out:
         _check_place(out)
+    if out and source.is_file() and source.suffix == ".onnx":
+        _complete(source, out)
+        return
     checkpoint = policy_files.find_checkpoint(source)
     beside = source / "policy.onnx" if source.is_dir() else source.with_suffix(".onnx")
     report = policy_files.export_checkpoint(checkpoint, out or beside)
@@ -71,6 +78,20 @@ def _export(source: Path, out: Path | None) -> None:
     for name, text in _describe(policy.metadata):
         table.add_row(name, text)
     make_console().print(table)
+
+
+def _complete(source: Path, out: Path) -> None:
+    """Write a policy file with the numbers of kiras-robot that robot.yaml has today."""
+    from kiras_rl.export import describe_again  # torch takes seconds
+
+    before = OnboardPolicy(source).metadata
+    after = policy_files.with_todays_profile(before)
+    if after.onboard is None:
+        raise PolicyError(
+            f"robots/{before.base_robot}/robot.yaml has no block onboard (docs/extending.md)"
+        )
+    describe_again(source, after, out)
+    print(f"wrote {out}")
 
 
 def _check_place(path: Path) -> None:
@@ -113,6 +134,7 @@ def _describe(metadata: PolicyMetadata) -> list[tuple[str, str]]:
         ("v_x", f"{ranges.lin_vel_x[0]:g} to {ranges.lin_vel_x[1]:g} m/s"),
         ("v_y", f"{ranges.lin_vel_y[0]:g} to {ranges.lin_vel_y[1]:g} m/s"),
         ("yaw rate", f"{ranges.ang_vel_z[0]:g} to {ranges.ang_vel_z[1]:g} rad/s"),
+        ("kiras-robot", "its numbers are in" if metadata.onboard else "robot.yaml has no onboard"),
         ("version", metadata.version),
     ]
 

@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from kiras_rl.deploy.policy import OnboardPolicy, PolicyError, PolicyMetadata
-from kiras_rl.robots.robot import Keyframe, Robot, RobotError, load_robot
+from kiras_rl.deploy.profile import Profile
+from kiras_rl.robots.robot import Keyframe, Robot, RobotError, list_robots, load_robot
 
 if TYPE_CHECKING:
     from kiras_rl.export import ExportReport
@@ -140,6 +141,16 @@ def _find(source: Path, in_run: tuple[str, ...], suffixes: tuple[str, ...]) -> P
     raise PolicyError(f"run {source} holds none of {', '.join(in_run)}{inside}")
 
 
+def with_todays_profile(metadata: PolicyMetadata) -> PolicyMetadata:
+    """Return a description with what kiras-robot needs, as robot.yaml has it today.
+
+    It stays as it is where the robot's folder has no block `onboard`, or is not here.
+    """
+    base = metadata.base_robot
+    onboard = load_robot(metadata.robot).onboard if base in list_robots() else None
+    return metadata if onboard is None else replace(metadata, onboard=Profile.from_dict(onboard))
+
+
 def export_checkpoint(checkpoint: Path, path: Path) -> ExportReport:
     """Export a checkpoint to a policy file.
 
@@ -151,6 +162,10 @@ def export_checkpoint(checkpoint: Path, path: Path) -> ExportReport:
     from kiras_rl.export import export_policy
 
     try:
-        return export_policy(*checkpoints.load_policy(checkpoint), path)
+        networks, description = checkpoints.load_policy(checkpoint)
+        metadata = PolicyMetadata.from_dict(description)
+        if metadata.onboard is None:
+            metadata = with_todays_profile(metadata)
+        return export_policy(networks, metadata, path)
     except ValueError as error:  # CheckpointError, ExportError: known without importing torch
         raise PolicyError(str(error)) from error

@@ -8,6 +8,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
+from kiras_rl.deploy.profile import Profile
+
 FORMAT = 1
 METADATA_KEY = "kiras"  # the entry of the ONNX file's metadata that holds the JSON text
 
@@ -69,6 +71,7 @@ class PolicyMetadata:
     clipped to `joint_limits`, (lowest, highest) per joint in rad. They and `velocity_limit`, in
     rad/s, are None in a file that was written before files held them; infinite for a joint that
     has none.
+    `onboard` is what kiras-robot needs, or None in a file of before, and of a robot that has none.
     `history_length` counts the past frames, without the current one; `control_rate` is in Hz.
     `provenance` is free: what made the file, for people to read.
 
@@ -94,6 +97,7 @@ class PolicyMetadata:
     provenance: dict[str, Any] = field(default_factory=dict)
     joint_limits: tuple[tuple[float, float], ...] | None = None
     velocity_limit: tuple[float, ...] | None = None
+    onboard: Profile | None = None
 
     def __post_init__(self) -> None:
         """Check lengths, names and signs, so that nothing later has to."""
@@ -107,6 +111,11 @@ class PolicyMetadata:
     def num_joints(self) -> int:
         """Number of joints, J."""
         return len(self.joint_names)
+
+    @property
+    def base_robot(self) -> str:
+        """Name of the robot without that of its variant: solo8 of solo8:12A."""
+        return self.robot.partition(":")[0]
 
     @property
     def frame_size(self) -> int:
@@ -125,7 +134,7 @@ class PolicyMetadata:
     def to_json(self) -> str:
         """Return the JSON text that travels in the policy file."""
         values = self.to_dict()
-        for name in _LATER:
+        for name in _LIMITS:
             values[name] = _without_infinity(values[name])
         return json.dumps(values, default=str)  # provenance may hold anything
 
@@ -172,7 +181,7 @@ class PolicyMetadata:
                 count == self.num_joints,
                 f"{name} holds {count} numbers for {self.num_joints} joints",
             )
-        for name in _LATER:
+        for name in _LIMITS:
             given = getattr(self, name)
             _require(
                 given is None or len(given) == self.num_joints,
@@ -283,7 +292,8 @@ def _command_range(values: Mapping[str, Any]) -> CommandRange:
     return CommandRange(**{axis: _interval(values[axis]) for axis in axes})
 
 
-_LATER = ("joint_limits", "velocity_limit")
+_LIMITS = ("joint_limits", "velocity_limit")
+_LATER = (*_LIMITS, "onboard")
 """Entries that files of the first versions lack."""
 
 _READERS: dict[str, Callable[[Any], Any]] = {
@@ -305,4 +315,5 @@ _READERS: dict[str, Callable[[Any], Any]] = {
     "command_range": _command_range,
     "version": str,
     "provenance": dict,
+    "onboard": Profile.from_dict,
 }

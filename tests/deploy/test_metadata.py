@@ -81,6 +81,34 @@ def test_limits_that_do_not_fit_are_named(make_metadata, changes, message):
         make_metadata(**changes)
 
 
+def test_a_file_of_before_has_no_profile(make_metadata):
+    data = make_metadata().to_dict()
+    del data["onboard"]
+    assert PolicyMetadata.from_dict(data).onboard is None
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"rate": 0.0}, r"onboard cannot be read \(ValueError\('rate is 0.0'\)\)"),
+        ({"max_tilt": float("nan")}, "max_tilt is nan"),
+        ({"max_power": None}, "onboard cannot be read"),
+        ({"late_ticks": [1, 2]}, "onboard cannot be read"),
+    ],
+)
+def test_a_profile_that_does_not_fit_is_named(make_metadata, changes, message):
+    onboard = {**make_metadata().to_dict()["onboard"], **changes}
+    with pytest.raises(PolicyError, match=message):
+        make_metadata(onboard=onboard)
+
+
+def test_a_profile_is_whole(make_metadata):
+    onboard = make_metadata().to_dict()["onboard"]
+    del onboard["slew"]
+    with pytest.raises(PolicyError, match=r"onboard cannot be read \(KeyError\('slew'\)\)"):
+        make_metadata(onboard=onboard)
+
+
 def test_a_missing_value_is_named(make_metadata):
     data = make_metadata().to_dict()
     del data["kp"], data["version"]

@@ -101,6 +101,36 @@ def test_mistakes_in_robot_yaml(edit, entries, message):
         edit("robot.yaml", **entries)
 
 
+ONBOARD = load_robot("solo8").onboard
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"rate": 0}, r"onboard.rate must be between 1 and 10000, not 0, in .*robot\.yaml"),
+        ({"max_kp": -1.0}, r"onboard.max_kp must be above 0, not -1\.0"),
+        ({"max_tilt": "steep"}, "onboard.max_tilt must be a number, not 'steep'"),
+        ({"max_power": None}, "onboard.max_power must be a number, not None"),
+        ({"min_battery": 10}, "onboard.min_battery must be between 0 and 1, not 10"),
+        ({"needs_calibration": 1}, "onboard.needs_calibration must be true or false, not 1"),
+        ({"late_ticks": [3, 1, 10]}, r"late_ticks must be three whole .*, not \[3, 1, 10\]"),
+        ({"late_ticks": 3}, "late_ticks must be three whole numbers"),
+        ({"max_tlit": 60.0}, r"unknown key 'max_tlit' in onboard of .*mean 'max_tilt'\?"),
+    ],
+)
+def test_mistakes_in_onboard(edit, changes, message):
+    with pytest.raises(RobotError, match=message):
+        edit("robot.yaml", onboard={**ONBOARD, **changes})
+
+
+def test_onboard_is_whole_or_not_there(edit):
+    assert edit("robot.yaml", onboard=None).onboard is None
+    with pytest.raises(RobotError, match=r"missing in onboard of .*robot\.yaml: slew"):
+        edit("robot.yaml", onboard={k: v for k, v in ONBOARD.items() if k != "slew"})
+    with pytest.raises(RobotError, match="onboard must hold `name: value` entries, not 3"):
+        edit("robot.yaml", onboard=3)
+
+
 def test_broken_yaml_is_located(edit, tmp_path):
     path = tmp_path / "solo8" / "keyframes.yaml"
     path.write_text("walk: {base_height: 0.2\n")

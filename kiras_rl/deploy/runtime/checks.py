@@ -1,5 +1,7 @@
 """What the runtime checks in every tick; each check has a name, a number and a consequence.
 
+Numbers are those of the policy file: its limits, and its profile of the robot.
+
 Letters: J joints.
 """
 
@@ -13,23 +15,8 @@ import numpy as np
 
 from kiras_rl.deploy.metadata import PolicyMetadata
 from kiras_rl.deploy.policy import LARGEST_READING, projected_gravity
+from kiras_rl.deploy.profile import DAMPS, LOWERS, WARNS, Profile
 from kiras_rl.deploy.runtime.messages import NANO, Flag, State
-from kiras_rl.deploy.runtime.profiles import Profile
-
-# Ours, where neither the policy file nor the robot's profile has a number.
-AGE = 2.0  # control periods that a reading may be old
-RANGE_MARGIN = 0.1  # rad that a joint may be beyond its range: a loaded joint passes its target
-# The same of a robot that lies, gets up or lies down: without torque legs fold to their stops,
-# farther than a policy may bend them: Go1's calves by 0.10 rad, Solo-8's knees in simulation by
-# 0.30.
-FOLDED_MARGIN = 0.4
-TORQUE_MARGIN = 1.2  # a motor that tells more than this times its limit does not obey it
-TILT = np.deg2rad(60.0)  # from the nearest keyframe that counts; the end of an episode in training
-TRACKING = 0.6  # rad between a slow target and its joint
-FROZEN = 0.5  # rad that a target travels while its encoder does not change at all
-FALLING = 3.0  # m/s^2 of specific force; at rest it is 9.81
-POWER_TIME = 0.5  # s of its mean
-MISSES = 1, 3, 10  # late ticks in a row: a warning, lying down, damping
 
 
 class Severity(IntEnum):
@@ -92,7 +79,7 @@ class Checks:
 
     Attributes:
         metadata: Of the policy file.
-        profile: Of the robot.
+        profile: Of the robot, with the numbers.
     """
 
     metadata: PolicyMetadata
@@ -150,9 +137,9 @@ class Checks:
             _Check("falling", damp, UPRIGHT, self._falls, ticks=round(0.2 / self._period)),
             _Check("temperature", lower, UPRIGHT, self._heat, ticks=25),
             _Check("battery", lower, UPRIGHT, self._charge, ticks=25),
-            _Check("deadline", damp, UPRIGHT, lambda view: self._late(view, MISSES[2])),
-            _Check("late", lower, UPRIGHT, lambda view: self._late(view, MISSES[1])),
-            _Check("miss", warn, LIVE, lambda view: self._late(view, MISSES[0])),
+            _Check("deadline", damp, UPRIGHT, lambda view: self._late(view, DAMPS)),
+            _Check("late", lower, UPRIGHT, lambda view: self._late(view, LOWERS)),
+            _Check("miss", warn, LIVE, lambda view: self._late(view, WARNS)),
             _Check("torn", warn, LIVE, self._torn),
         )
 
@@ -164,7 +151,7 @@ class Checks:
         self._travel = np.where(still, travelled, 0.0)
         self._pos, self._target = pos, view.target.copy()
         pushed = np.maximum(self._joints(view, "torque") * self._joints(view, "joint_vel"), 0.0)
-        share = min(1.0, self._period / POWER_TIME)
+        share = min(1.0, self._period / self.profile.power_time)
         power = float(np.nan_to_num(pushed).sum())
         self._power += share * (power - self._power)
 
@@ -181,9 +168,10 @@ class Checks:
 
     def _fresh(self, view: View) -> str:
         age = (view.now - int(view.reading["time"])) / NANO
-        if -self._period < age <= AGE * self._period:
+        most = self.profile.max_age * self._period
+        if -self._period < age <= most:
             return ""
-        return f"the last reading is {1000 * age:.0f} ms old, {2000 * self._period:.0f} are allowed"
+        return f"the last reading is {1000 * age:.0f} ms old, {1000 * most:.0f} are allowed"
 
     def _sequence(self, view: View) -> str:
         before, self._seq = self._seq, int(view.reading["seq"])
@@ -205,19 +193,18 @@ class Checks:
 
     def _lean(self, view: View) -> str:
         gravity = projected_gravity(view.reading["quat"].astype(np.float64))
-        angle = float(np.arccos(np.clip((view.gravity @ gravity).max(), -1.0, 1.0)))
-        if angle <= TILT:
+        angle = _degrees(float((view.gravity @ gravity).max()))
+        most = self.profile.max_tilt
+        if angle <= most:
             return ""
-        return (
-            f"{np.rad2deg(angle):.0f} degrees from the posture, {np.rad2deg(TILT):.0f} are allowed"
-        )
+        return f"{angle:.0f} degrees from the posture, {most:.0f} are allowed"
 
     def _range(self, view: View) -> str:
         pos = self._joints(view, "joint_pos")
         beyond = np.maximum(self._low - pos, pos - self._high)
         worst = int(np.argmax(beyond))
-        stands = view.state in (State.STANDING, State.POLICY)
-        if beyond[worst] <= (RANGE_MARGIN if stands else FOLDED_MARGIN):
+        stands, numbers = view.state in (State.STANDING, State.POLICY), self.profile
+        if beyond[worst] <= (numbers.range_margin if stands else numbers.folded_margin):
             return ""
         return (
             f"{self.metadata.joint_names[worst]} is at {pos[worst]:.2f} rad, "
@@ -228,7 +215,7 @@ class Checks:
         return self._over(np.abs(self._joints(view, "joint_vel")), self._speed, "turns at", "rad/s")
 
     def _strong(self, view: View) -> str:
-        limit = TORQUE_MARGIN * self._torque
+        limit = self.profile.torque_factor * self._torque
         return self._over(np.abs(self._joints(view, "torque")), limit, "gives", "N m")
 
     def _powerful(self, view: View) -> str:
@@ -237,43 +224,48 @@ class Checks:
 
     def _heat(self, view: View) -> str:
         degrees = np.nan_to_num(self._joints(view, "temperature"), nan=-np.inf)
-        limit = np.full(len(degrees), self.profile.max_temperature)
-        return self._over(degrees, limit, "is at", "degrees Celsius")
+        limit = self.profile.max_temperature
+        if limit is None:
+            return ""
+        return self._over(degrees, np.full(len(degrees), limit), "is at", "degrees Celsius")
 
     def _charge(self, view: View) -> str:
-        share, least = float(view.reading["battery"]), self.profile.min_battery
-        low = share < least  # false where it is not measured
+        share, least = float(view.reading["battery"]), self.profile.min_battery or 0.0
+        low = share < least  # false where it is not measured, for then it is NaN
         return f"the battery is at {100 * share:.0f} %, {100 * least:.0f} are needed" if low else ""
 
     def _frozen(self, view: View) -> str:
         worst = int(np.argmax(self._travel))
-        if self._travel[worst] <= FROZEN:
+        if self._travel[worst] <= self.profile.frozen_travel:
             return ""
         name, way = self.metadata.joint_names[worst], self._travel[worst]
         return f"{name} tells the same angle while its target went {way:.2f} rad"
 
     def _far(self, view: View) -> str:
         error = np.abs(view.target - self._joints(view, "joint_pos"))
-        return self._over(error, np.full(len(error), TRACKING), "is off its target by", "rad")
+        most = np.full(len(error), self.profile.tracking_error)
+        return self._over(error, most, "is off its target by", "rad")
 
     def _falls(self, view: View) -> str:
         force = float(np.linalg.norm(view.reading["acc"]))
-        return f"{force:.1f} m/s^2 of specific force: falling freely" if force < FALLING else ""
+        falls = force < self.profile.free_fall
+        return f"{force:.1f} m/s^2 of specific force: falling freely" if falls else ""
 
     def _imu(self, view: View) -> str:
         """At rest the accelerometer shows up, where the orientation has to agree."""
         acc = view.reading["acc"].astype(np.float64)
         up = -projected_gravity(view.reading["quat"].astype(np.float64))
         cosine = acc @ up / max(float(np.linalg.norm(acc)), 1e-6)
-        angle = float(np.rad2deg(np.arccos(np.clip(cosine, -1.0, 1.0))))
-        if angle <= 20.0:
+        angle = _degrees(float(cosine))
+        if angle <= self.profile.imu_error:
             return ""
         return (
             f"accelerometer and orientation disagree by {angle:.0f} degrees: check the IMU's axes"
         )
 
-    def _late(self, view: View, count: int) -> str:
-        return f"{view.misses} ticks in a row came late" if view.misses >= count else ""
+    def _late(self, view: View, place: int) -> str:
+        late = view.misses >= self.profile.late_ticks[place]
+        return f"{view.misses} ticks in a row came late" if late else ""
 
     def _over(self, values: np.ndarray, most: np.ndarray, verb: str, unit: str) -> str:
         worst = int(np.argmax(values - most))
@@ -281,3 +273,7 @@ class Checks:
             return ""
         name = self.metadata.joint_names[worst]
         return f"{name} {verb} {values[worst]:.2f} {unit}, {most[worst]:.2f} are allowed"
+
+
+def _degrees(cosine: float) -> float:
+    return float(np.rad2deg(np.arccos(np.clip(cosine, -1.0, 1.0))))

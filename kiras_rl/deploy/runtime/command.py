@@ -21,7 +21,7 @@ from kiras_rl.deploy.runtime.hands import EMERGENCY, Gamepad, Hand, Keyboard, Re
 from kiras_rl.deploy.runtime.mailbox import SHARED, BusyError
 from kiras_rl.deploy.runtime.messages import NANO, Mode, Request, State
 from kiras_rl.deploy.runtime.processes import ROLES, Setup
-from kiras_rl.deploy.runtime.profiles import Profile, profile_of
+from kiras_rl.deploy.runtime.profiles import profile_of, source_of
 from kiras_rl.deploy.runtime.scripts import Script, ScriptError, parse_script
 
 _DESCRIPTION = """\
@@ -53,8 +53,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if kind == "check":
             return _check(path)
         return Session(kind, path, options).run()
-    except KeyError as error:
-        print(f"error: {error.args[0]}", file=sys.stderr)
     except (BusyError, LinkError, PolicyError, ScriptError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
     return 2
@@ -133,15 +131,15 @@ class Session:
         """
         policy = OnboardPolicy(path)
         self._meta: PolicyMetadata = policy.metadata
-        self._profile: Profile = profile_of(self._meta.robot)
-        if kind not in ("sim", self._profile.name):
+        profile = profile_of(self._meta)
+        if kind not in ("sim", self._meta.base_robot):
             raise PolicyError(f"{path} is a policy of {self._meta.robot}, not of {kind}")
-        refusals = preflight.refusals(policy, self._profile)
+        refusals = preflight.refusals(policy, profile)
         if refusals:
             raise PolicyError(f"{path}: {refusals[0]}")
         self._script = parse_script(options.script, self._meta) if options.script else None
         root = Path(os.environ.get("KIRAS_ROBOT_SHARED", SHARED))
-        self._channel = Channel(self._profile.name, root)
+        self._channel = Channel(self._meta.base_robot, root)
         self._channel.operator.take()
         for seat in (self._channel.driver, self._channel.runtime):
             if seat.is_taken():
@@ -179,6 +177,8 @@ class Session:
                 print(f"{self._meta.robot}: events and black boxes in {self._folder}")
                 print(device.help)
                 self._children = {role: self._start(role) for role in ROLES}
+                if self._meta.onboard is None:
+                    print(f"checks by the numbers of {source_of(self._meta)}")
                 keep_pace(lambda now: self._tick(device, now), _RATE)
         finally:
             signal.signal(signal.SIGINT, before)

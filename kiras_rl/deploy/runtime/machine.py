@@ -10,10 +10,10 @@ from collections.abc import Callable
 import numpy as np
 
 from kiras_rl.deploy.policy import OnboardPolicy, PolicyError, projected_gravity
+from kiras_rl.deploy.profile import Profile
 from kiras_rl.deploy.runtime.checks import Checks, Severity, View
 from kiras_rl.deploy.runtime.messages import NANO, ORDER, Flag, Mode, Request, State
 from kiras_rl.deploy.runtime.motion import Path
-from kiras_rl.deploy.runtime.profiles import Profile
 
 VALID = 2.0  # control periods that an order counts
 STEADY = 0.5  # s without a finding before motors may be switched on, and before the robot may rise
@@ -22,11 +22,7 @@ FIRST = 0.5  # s that the policy drives the posture in which it took over
 ACCELERATION = np.array([1.0, 1.0, 2.0])  # of commands, m/s^2, m/s^2, rad/s^2
 SILENT = 0.5  # s without the operator: the command goes to zero
 LOST = 2.0  # s without the operator: the robot lies down
-NEAR = 0.25  # rad between joints and posture where the policy takes over
-UPRIGHT = np.deg2rad(10.0)  # between the tilt and that of the posture there
-CLOSE = 0.4  # rad between the policy's first targets and those that are held
 LEAD = 0.2  # rad that a slow move may begin away from where a joint is
-SLEW = 2.0  # of the policy file's action_scale, that a target may change in a control period
 
 
 class Runtime:
@@ -218,23 +214,23 @@ class Runtime:
             self._enter(State.POLICY, now)
 
     def _why_not_walk(self, reading: np.ndarray) -> str:
-        joints = len(self._kp)
+        joints, most = len(self._kp), self._profile
         error = np.abs(reading["joint_pos"][:joints] - self._poses[0])
-        if error.max() > NEAR:
+        if error.max() > most.takeover_joint:
             name = self._policy.metadata.joint_names[int(np.argmax(error))]
-            return f"{name} is {error.max():.2f} rad off its posture, {NEAR} are allowed"
+            off = f"{name} is {error.max():.2f} rad off its posture"
+            return f"{off}, {most.takeover_joint} are allowed"
         gravity = projected_gravity(reading["quat"].astype(np.float64))
-        tilt = np.arccos(np.clip(gravity @ self._gravity[0], -1.0, 1.0))
-        if tilt > UPRIGHT:
-            degrees = np.rad2deg([tilt, UPRIGHT])
-            return f"tilted by {degrees[0]:.0f} degrees, {degrees[1]:.0f} are allowed"
+        tilt = np.rad2deg(np.arccos(np.clip(gravity @ self._gravity[0], -1.0, 1.0)))
+        if tilt > most.takeover_tilt:
+            return f"tilted by {tilt:.0f} degrees, {most.takeover_tilt:.0f} are allowed"
         self._policy.reset(self._target)
         first = self._drive(reading, 0)
         jump = float(np.abs(first - self._target).max())
         self._policy.reset(self._target)
-        if jump <= CLOSE:
+        if jump <= most.takeover_target:
             return ""
-        return f"its first target is {jump:.2f} rad away, {CLOSE} are allowed"
+        return f"its first target is {jump:.2f} rad away, {most.takeover_target} are allowed"
 
     # --- acting ----------------------------------------------------------------------------------
 
@@ -315,7 +311,7 @@ class Runtime:
         except PolicyError as error:
             self._damp("policy", str(error), now)
             return Mode.DAMP
-        step = SLEW * np.array(self._policy.metadata.action_scale)
+        step = self._profile.slew * np.array(self._policy.metadata.action_scale)
         self._target = self._target + np.clip(asked - self._target, -step, step)
         return Mode.SERVO
 

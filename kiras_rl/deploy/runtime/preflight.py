@@ -13,10 +13,10 @@ from pathlib import Path
 import numpy as np
 
 from kiras_rl.deploy.policy import OnboardPolicy
-from kiras_rl.deploy.runtime.checks import FOLDED_MARGIN, RANGE_MARGIN, TILT
+from kiras_rl.deploy.profile import Profile
 from kiras_rl.deploy.runtime.driver import keep_pace
 from kiras_rl.deploy.runtime.messages import NANO
-from kiras_rl.deploy.runtime.profiles import Profile, profile_of
+from kiras_rl.deploy.runtime.profiles import profile_of, source_of
 
 STEPS = 500  # of the network
 SECONDS = 2.0  # of each loop
@@ -29,12 +29,12 @@ def check(path: Path) -> tuple[list[str], list[str]]:
         Lines to read, and what makes kiras-robot refuse it.
 
     Raises:
-        PolicyError: If the file is no policy.
-        KeyError: If there is no profile of its robot.
+        PolicyError: If the file is no policy, or there is no profile of its robot.
     """
     policy = OnboardPolicy(path)
-    profile = profile_of(policy.metadata.robot)
-    lines = [*_file(policy, path), *_joints(policy), *_first_targets(policy), *_limits(profile)]
+    profile = profile_of(policy.metadata)
+    lines = [*_file(policy, path), *_joints(policy), *_first_targets(policy)]
+    lines += [*_limits(profile), f"numbers      of {source_of(policy.metadata)}"]
     lines += _deadlines(policy, profile)
     return lines, refusals(policy, profile)
 
@@ -44,8 +44,8 @@ def refusals(policy: OnboardPolicy, profile: Profile) -> list[str]:
     meta, found = policy.metadata, []
     if max(meta.kp) > profile.max_kp:
         found.append(
-            f"kp is {max(meta.kp):g} N m/rad, and {profile.name}'s electronics carry "
-            f"{profile.max_kp:g}: train with less (kp in robots/{profile.name}/robot.yaml)"
+            f"kp is {max(meta.kp):g} N m/rad, and {meta.base_robot}'s electronics carry "
+            f"{profile.max_kp:g}: train with less (kp in robots/{meta.base_robot}/robot.yaml)"
         )
     for skill, posture in meta.keyframes.items():
         for j, (low, high) in enumerate(_ranges(policy)):
@@ -108,11 +108,17 @@ def _first_targets(policy: OnboardPolicy) -> Iterator[str]:
 
 
 def _limits(profile: Profile) -> Iterator[str]:
+    hottest, least = profile.max_temperature, profile.min_battery
+    warns, lowers, damps = profile.late_ticks
     yield (
-        f"checks       range + {RANGE_MARGIN:g} rad ({FOLDED_MARGIN:g} lying), "
-        f"tilt {np.rad2deg(TILT):.0f} degrees, power {profile.max_power:g} W, "
-        f"motors {profile.max_temperature:g} degrees Celsius, "
-        f"battery {100 * profile.min_battery:.0f} %"
+        f"checks       range + {profile.range_margin:g} rad ({profile.folded_margin:g} lying), "
+        f"tilt {profile.max_tilt:g} degrees, torque x {profile.torque_factor:g}, "
+        f"power {profile.max_power:g} W, free fall {profile.free_fall:g} m/s^2"
+    )
+    yield (
+        f"             motors {'not measured' if hottest is None else f'{hottest:g} degC'}, "
+        f"battery {'not measured' if least is None else f'{100 * least:.0f} %'}, "
+        f"late ticks {warns} warn, {lowers} lower, {damps} damp"
     )
 
 

@@ -17,13 +17,14 @@ import numpy as np
 
 from kiras_rl.deploy.metadata import PolicyError
 from kiras_rl.deploy.policy import OnboardPolicy
+from kiras_rl.deploy.profile import Profile
 from kiras_rl.deploy.runtime.blackbox import LENGTH, Ring
 from kiras_rl.deploy.runtime.driver import Channel, Driver, Link, LinkError, keep_pace
 from kiras_rl.deploy.runtime.go1 import Go1
 from kiras_rl.deploy.runtime.machine import Runtime
 from kiras_rl.deploy.runtime.mailbox import SHARED, BusyError
 from kiras_rl.deploy.runtime.messages import NANO, State
-from kiras_rl.deploy.runtime.profiles import Profile, profile_of
+from kiras_rl.deploy.runtime.profiles import profile_of
 from kiras_rl.deploy.runtime.solo8 import Solo8, open_socket, read_calibration
 
 PRIORITIES = {"driver": 80, "runtime": 70}  # of SCHED_FIFO, where the system lets us have it
@@ -96,8 +97,8 @@ def open_link(setup: Setup, policy: OnboardPolicy, profile: Profile) -> Link:
 def _join(setup: Setup) -> tuple[OnboardPolicy, Profile, Channel]:
     """Load the policy, and open the channel of its robot."""
     policy = OnboardPolicy(setup.policy)
-    profile = profile_of(policy.metadata.robot)
-    return policy, profile, Channel(profile.name, Path(setup.root))
+    channel = Channel(policy.metadata.base_robot, Path(setup.root))
+    return policy, profile_of(policy.metadata), channel
 
 
 def drive(setup: Setup) -> None:

@@ -11,9 +11,9 @@ import mujoco
 import numpy as np
 
 from kiras_rl.deploy.metadata import PolicyMetadata
+from kiras_rl.deploy.profile import Profile
 from kiras_rl.deploy.runtime.driver import Link
 from kiras_rl.deploy.runtime.messages import Flag, Mode
-from kiras_rl.deploy.runtime.profiles import Profile
 from kiras_rl.robots.robot import load_robot
 
 STEP = 0.001  # s of physics

@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from kiras_rl.deploy.runtime.checks import FROZEN, Checks, Severity, View
+from kiras_rl.deploy.profile import Profile
+from kiras_rl.deploy.runtime.checks import Checks, Severity, View
 from kiras_rl.deploy.runtime.messages import NANO, Flag, State, make_reading
-from kiras_rl.deploy.runtime.profiles import profile_of
+from kiras_rl.robots.robot import load_robot
 
 PERIOD = NANO // 50
 LEVEL = np.array([[0.0, 0.0, -1.0]])
@@ -21,7 +22,11 @@ def metadata(make_metadata):
 
 @pytest.fixture
 def checks(metadata):
-    return Checks(metadata, profile_of("go1"))  # a robot that measures temperature and battery
+    return Checks(metadata, profile("go1"))  # a robot that measures temperature and battery
+
+
+def profile(robot, **changes):
+    return Profile.from_dict({**load_robot(robot).onboard, **changes})
 
 
 class Ticks:
@@ -141,7 +146,7 @@ def test_an_encoder_that_does_not_change_is_found_once_its_target_has(checks, me
         ticks.reading["joint_pos"][5] = stuck
         if found := ticks.step(moves=False):
             break
-    assert (found[0].name, tick) == ("frozen", int(FROZEN / 0.15) + 1)
+    assert (found[0].name, tick) == ("frozen", int(0.5 / 0.15) + 1)
     assert metadata.joint_names[5] in found[0].text
 
 
@@ -155,6 +160,44 @@ def test_a_joint_that_does_not_follow_a_slow_target_is_found(checks, metadata):
         ticks.reading["joint_pos"][:8] += ticks.random.normal(0, 1e-4, 8)
         found = ticks.step(moves=False)
     assert (found[0].name, tick) == ("tracking", 10)
+
+
+CHANGED = {
+    # number: another value, and a reading that it makes a fault of, or no fault any more
+    "max_age": (4.0, None, None, None, ""),
+    "max_tilt": (20.0, "quat", None, (0.97, 0.24, 0.0, 0.0), "tilt"),  # 28 degrees of roll
+    "range_margin": (0.0, "joint_pos", 0, 1.46, "range"),
+    "torque_factor": (1.0, "torque", 1, 1.9, "torque"),
+    "free_fall": (5.0, "acc", None, (0.0, 0.0, 4.0), "falling"),
+    "max_temperature": (50.0, "temperature", 4, 60.0, "temperature"),
+    "min_battery": (0.5, "battery", None, 0.4, "battery"),
+    "late_ticks": ([5, 6, 7], "misses", None, 4, ""),
+}
+
+
+@pytest.mark.parametrize("name", CHANGED)
+def test_numbers_are_the_profile_s(name, metadata):
+    value, field, joint, measured, expected = CHANGED[name]
+
+    def found_with(numbers):
+        ticks = Ticks(Checks(metadata, numbers), metadata)
+        ticks.target = ticks.target.copy()
+        ticks.step()
+        if field == "misses":
+            ticks.misses = measured
+        elif field == "joint_pos":
+            ticks.target[joint] = measured
+        elif joint is not None:
+            ticks.reading[field][joint] = measured
+        elif field is not None:
+            ticks.reading[field] = measured
+        arrives = name != "max_age"
+        found = [ticks.step(arrives=arrives) for _ in range(60 if arrives else 4)]
+        return {finding.name for findings in found for finding in findings}
+
+    usual, changed = found_with(profile("go1")), found_with(profile("go1", **{name: value}))
+    assert changed == ({expected} if expected else set())
+    assert bool(usual) is not bool(changed)
 
 
 @pytest.mark.parametrize(
@@ -173,7 +216,7 @@ def test_late_ticks_in_a_row_have_consequences(checks, metadata, misses, name, s
 
 
 def test_what_was_not_measured_is_not_judged(metadata):
-    ticks = Ticks(Checks(metadata, profile_of("solo8")), metadata)
+    ticks = Ticks(Checks(metadata, profile("solo8")), metadata)
     assert np.isnan(ticks.reading["battery"])
     assert np.isnan(ticks.reading["temperature"]).all()
     assert all(ticks.step() == [] for _ in range(60))
