@@ -11,7 +11,7 @@ from pathlib import Path
 from kiras_rl.config import ConfigError
 from kiras_rl.deploy.policy import PolicyError
 from kiras_rl.robots.robot import RobotError
-from kiras_rl.tools import policy_files, summary
+from kiras_rl.tools import policy_files, replay, summary
 from kiras_rl.tools.arguments import PICTURES, file_of
 from kiras_rl.tools.console import make_console
 from kiras_rl.tools.driver import Driver
@@ -30,6 +30,7 @@ from kiras_rl.tools.script import (
 from kiras_rl.tools.viewer import DEFAULT_PORT, LOOPBACK, LiveError
 from kiras_rl.tools.viewer.choices import title_of
 from kiras_rl.tools.viewer.cockpit import Cockpit
+from kiras_rl.tools.viewer.playback import Playback
 
 _DESCRIPTION = """\
 Drive one simulated robot with a trained policy, through the same code that runs on a real robot, on
@@ -50,6 +51,9 @@ and then shows every skill for four. A robot that falls is put back into the pos
 where they are left out. The tiles are those of the policy's run, or else of its robot's
 configuration; odd variants of slopes lead down. At the end of its tile the robot starts again in
 the middle.
+
+--log shows a black box of kiras-robot in place of a simulation, beside the keyframe of its skill:
+in the page or with --terminal. POLICY is then the one that ran, whose keyframes are meant.
 Exit status: 0, also after Ctrl-C, or 2 if something was wrong with what was given.
 """
 
@@ -65,6 +69,7 @@ examples:
   kiras-play --trace trace.png                      posture, speed, contacts, torques over time
   kiras-play --frames strip.png --video walk.mp4    pictures and a film
   kiras-play --command 0.5,0,0.3                    every skill, turning left at 0.3 rad/s
+  kiras-play --log robot_logs/2026-01-31_12-00-00/blackbox_1    what a robot did before a fault
   kiras-play --script walk:4:0.3,crawl:4:0.3        skill:seconds:v_x[:v_y[:yaw_rate]], ...
 """
 
@@ -86,6 +91,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     def work() -> None:
         _check_outputs(options)
+        _check_log(options)
         with suppress(KeyboardInterrupt):  # Ctrl-C is how a drive ends
             _drive(options) if _is_live(options) else _play(options)
 
@@ -111,6 +117,7 @@ def _parser() -> argparse.ArgumentParser:
         metavar="V_X[,V_Y[,YAW]]",
         help="command for every skill, m/s and rad/s (0.3)",
     )
+    tasks.add_argument("--log", type=Path, metavar="FOLDER", help="show a black box of kiras-robot")
     add("--terrain", metavar="TYPE[:LEVEL[:VARIANT]]", help="ground to drive on, as above (flat)")
     add("--table", action="store_true", help="print every skill's errors")
     for name, (endings, text) in _OUTPUTS.items():
@@ -135,6 +142,18 @@ def _check_outputs(options: argparse.Namespace) -> None:
             check_output(path, f"kiras-play {option}")
 
 
+def _check_log(options: argparse.Namespace) -> None:
+    """Refuse what a log cannot be combined with.
+
+    Raises:
+        PolicyError: If there is something of that.
+    """
+    others = ("terrain", "follow", "table", "trace", "frames", "video", "screenshot")
+    given = [f"--{name}" for name in others if getattr(options, name)]
+    if options.log and given:
+        raise PolicyError(f"--log is only shown, in the page or with --terminal: no {given[0]}")
+
+
 def _is_live(options: argparse.Namespace) -> bool:
     scripted = options.script or options.command or options.table
     return not (scripted or options.trace or options.frames or options.video)
@@ -143,6 +162,20 @@ def _is_live(options: argparse.Namespace) -> bool:
 def _drive(options: argparse.Namespace) -> None:
     """Let a person drive, or take a picture of what they would see."""
     from kiras_rl.tools.viewer import live  # mujoco.studio: what a script does not need
+
+    cockpit = _playback(options) if options.log else _cockpit(options)
+    follow = options.policy if options.follow else None
+    if options.screenshot:
+        live.save_screenshot(cockpit, options.screenshot, speed=_SCREENSHOT_SPEED)
+        print(f"wrote {options.screenshot}")
+    elif options.terminal:
+        live.drive_terminal(cockpit, follow)
+    else:
+        live.drive_page(cockpit, options.host, options.port, not options.no_browser, follow)
+
+
+def _cockpit(options: argparse.Namespace) -> Cockpit:
+    from kiras_rl.tools.viewer import live
 
     source = options.policy
     if options.follow:
@@ -153,15 +186,13 @@ def _drive(options: argparse.Namespace) -> None:
         policy = policy_files.load_policy(source, options.robot)
     shipped = source or policy_files.shipped_policy(policy.metadata.robot)
     tile = terrain_of(policy.metadata).parse(options.terrain) if options.terrain else FLAT
-    cockpit = Cockpit(policy, title_of(shipped), tile=tile)
-    follow = source if options.follow else None
-    if options.screenshot:
-        live.save_screenshot(cockpit, options.screenshot, speed=_SCREENSHOT_SPEED)
-        print(f"wrote {options.screenshot}")
-    elif options.terminal:
-        live.drive_terminal(cockpit, follow)
-    else:
-        live.drive_page(cockpit, options.host, options.port, not options.no_browser, follow)
+    return Cockpit(policy, title_of(shipped), tile=tile)
+
+
+def _playback(options: argparse.Namespace) -> Playback:
+    log = replay.load_log(options.log)
+    policy = replay.policy_of(log, options.policy)
+    return Playback(policy, log, f"{log.robot}: {options.log.resolve().name}")
 
 
 def _play(options: argparse.Namespace) -> None:

@@ -19,18 +19,18 @@ HELD = {
 """Keys that act as long as they are held: axis and direction."""
 
 PRESSED = {
-    "Space": Cockpit.stop,
-    "P": Cockpit.push,
-    "R": Cockpit.reset,
-    "T": Cockpit.toggle_pause,
-    "N": Cockpit.single_step,
-    "M": Cockpit.next_speed,
-    "F": Cockpit.next_terrain,
-    "K": Cockpit.lower_level,
-    "L": Cockpit.raise_level,
-    "V": Cockpit.next_variant,
+    "Space": "stop",
+    "P": "push",
+    "R": "reset",
+    "T": "toggle_pause",
+    "N": "single_step",
+    "M": "next_speed",
+    "F": "next_terrain",
+    "K": "lower_level",
+    "L": "raise_level",
+    "V": "next_variant",
 }
-"""Keys that act once; the digits 1 to 9 choose a skill."""
+"""Keys that act once, by methods of the cockpit; the digits 1 to 9 choose a skill."""
 
 HELP = (
     "1..9 skill   W S faster, slower   A D turn   Q E sideways   Space stop",
@@ -48,7 +48,7 @@ def press(cockpit: Cockpit, key: str) -> bool:
         key: A key of `PRESSED`, or a digit.
     """
     if key in PRESSED:
-        cockpit.post(PRESSED[key], cockpit)
+        cockpit.post(getattr(cockpit, PRESSED[key]))
     elif key.isdigit() and 1 <= int(key) <= len(cockpit.skills):
         cockpit.post(cockpit.choose_skill, int(key) - 1)
     else:

@@ -50,6 +50,11 @@ class Telemetry:
             self._rows[self._count % len(self._rows)] = row
             self._count += 1
 
+    def clear(self) -> None:
+        """Forget all samples."""
+        with self._lock:
+            self._count = 0
+
     def view(self) -> dict[str, np.ndarray]:
         """Copy what is kept: a column for each name of `COLUMNS`, (T,), oldest first."""
         with self._lock:
