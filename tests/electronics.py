@@ -116,8 +116,8 @@ class MasterBoard:
 
     TIMEOUT = 20 * MS  # CONFIG_WIFI_ETH_TIMEOUT_CONTROL of the firmware
 
-    def __init__(self, plant: Plant, seed: int = 0) -> None:
-        self._plant = plant
+    def __init__(self, plant: Plant, seed: int = 0, protocol: int = 3) -> None:
+        self._plant, self._protocol = plant, protocol
         self._own, self.wire = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
         self._own.setblocking(False)
         random = np.random.default_rng(seed)
@@ -143,7 +143,7 @@ class MasterBoard:
         if not self.plugged:
             return
         if self.state == "acknowledging":
-            self._send(solo8.ANSWER.pack(self._session, 0b1111))
+            self._answer(self._session)
         else:
             self._count += 1
             for message in self.spoil(self._sensor().tobytes(), now):
@@ -163,14 +163,22 @@ class MasterBoard:
         except (BlockingIOError, ConnectionError):
             return
 
+    def _answer(self, session: int) -> None:
+        if self._protocol == 4:
+            self._send(solo8.ANSWER_4.pack(4, session, 0b1111))
+        else:
+            self._send(solo8.ANSWER.pack(session, 0b1111))
+
     def _receive(self, now: int) -> None:
         try:
             while True:
                 payload = solo8.payload_of(self._own.recv(2048))
                 if len(payload) == solo8.HELLO.size and self.state in ("waiting", "error"):
                     protocol, session = solo8.HELLO.unpack(payload)
-                    if protocol == solo8.PROTOCOL:
+                    if protocol == self._protocol:
                         self._session, self.state = session, "acknowledging"
+                    elif self._protocol == 4:
+                        self._answer(session)  # to say which protocol it speaks
                 elif len(payload) == solo8.COMMAND.itemsize and self.state != "waiting":
                     command = np.frombuffer(payload, solo8.COMMAND)[0]
                     if command["session"] == self._session and self.state != "error":
@@ -209,7 +217,8 @@ class MasterBoard:
         return np.where(self._seen & compensates, self.zero, self._boot)
 
     def _sensor(self) -> np.ndarray:
-        reading, sensor = self._reading, np.zeros((), solo8.SENSOR)
+        kind = solo8.SENSOR_4 if self._protocol == 4 else solo8.SENSOR
+        reading, sensor = self._reading, np.zeros((), kind)
         self._plant.measure(reading)
         sensor["session"], sensor["index"] = self._session, self._count % 2**16
         boards = sensor["board"][:4]
@@ -240,9 +249,9 @@ def go1_world(rig: Rig) -> go1.Go1:
     return go1.Go1(f"127.0.0.1:{rig.electronics.port}", 12, rig.profile.damping, 0)
 
 
-def solo8_world(rig: Rig) -> solo8.Solo8:
+def solo8_world(rig: Rig, protocol: int = 3) -> solo8.Solo8:
     """Put a Solo-8's electronics and our driver's link to it into a rig."""
-    rig.electronics = MasterBoard(rig.plant)
+    rig.electronics = MasterBoard(rig.plant, protocol=protocol)
     torque = np.array(rig.policy.metadata.torque_limit)
     return solo8.Solo8(rig.electronics.wire, rig.electronics.zero, torque, rig.profile.damping)
 

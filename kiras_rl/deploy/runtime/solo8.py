@@ -1,8 +1,10 @@
-"""Solo-8 by the Ethernet frames of its master board, protocol 3, in which the SDK's wheel speaks.
+"""Solo-8 by the Ethernet frames of its master board, in protocols 3 and 4.
 
 Sources: protocol.h, defines.h, ETHERNET_types.h and documentation/BLMC_uDriver_SPI_interface.md of
-open-dynamic-robot-initiative/master-board 1.0; motors and gear as in odri_control_interface at
-dcc07e4 and solo8.cpp of open-dynamic-robot-initiative/solo at 0babe3d.
+open-dynamic-robot-initiative/master-board 1.0, whose wheel speaks 3; for 4 main/defines.h and
+masterboard_main.c of the later firmware (JonathanEh01/master-board at ee6db8f), which adds the
+power board's numbers to a measurement, and its version to an answer. Motors and gear as in
+odri_control_interface at dcc07e4 and solo8.cpp of open-dynamic-robot-initiative/solo at 0babe3d.
 
 The PD controller runs on the motor boards, within a current that they saturate, so that no jitter
 of this computer gets into it. Numbers on the wire are of the motor, before the gear.
@@ -22,7 +24,7 @@ import numpy as np
 from kiras_rl.deploy.runtime.driver import Link, LinkError
 from kiras_rl.deploy.runtime.messages import NANO, Flag, Mode
 
-PROTOCOL = 3
+PROTOCOLS = (3, 4)
 ETHERTYPE = 0x88B5  # for local experiments
 SOURCE = bytes.fromhex("a01d4812a0c5")  # the SDK's address; the board answers to everybody
 EVERYBODY = b"\xff" * 6
@@ -66,35 +68,42 @@ COMMAND = np.dtype(
 )
 """From the computer, 172 bytes."""
 
-SENSOR = np.dtype(
-    [
-        ("session", "<u2"),
-        (
-            "board",
-            [
-                ("status", "<u2"),
-                ("timestamp", "<u2"),
-                ("position", "<i4", 2),
-                ("velocity", "<i2", 2),
-                ("current", "<i2", 2),
-                ("resistance", "<u2", 2),
-                ("adc", "<u2", 2),
-            ],
-            BOARDS,
-        ),
-        ("acc", "<i2", 3),  # g, Q11
-        ("gyro", "<i2", 3),  # rad/s, Q11
-        ("attitude", "<i2", 3),  # roll, pitch, yaw, rad, Q13
-        ("linear_acc", "<i2", 3),  # g, Q11, without gravity
-        ("index", "<u2"),
-        ("lost", "<u2"),  # commands
-        ("last_command", "<u2"),
-    ]
-)
-"""From the board, 200 bytes."""
+_MEASURED = [
+    ("session", "<u2"),
+    (
+        "board",
+        [
+            ("status", "<u2"),
+            ("timestamp", "<u2"),
+            ("position", "<i4", 2),
+            ("velocity", "<i2", 2),
+            ("current", "<i2", 2),
+            ("resistance", "<u2", 2),
+            ("adc", "<u2", 2),
+        ],
+        BOARDS,
+    ),
+    ("acc", "<i2", 3),  # g, Q11
+    ("gyro", "<i2", 3),  # rad/s, Q11
+    ("attitude", "<i2", 3),  # roll, pitch, yaw, rad, Q13
+    ("linear_acc", "<i2", 3),  # g, Q11, without gravity
+]
+_POWER = [
+    ("bus", "<u2"),  # 3.125 mV
+    ("shunt", "<i2"),  # 5 uV over 4 mOhm
+    ("energy", "<f4"),  # the product of both, summed
+]
+_COUNTS = [("index", "<u2"), ("lost", "<u2"), ("last_command", "<u2")]  # lost: commands
+
+SENSOR = np.dtype([*_MEASURED, *_COUNTS])
+"""From a board of protocol 3, 200 bytes."""
+
+SENSOR_4 = np.dtype([*_MEASURED, *_POWER, *_COUNTS])
+"""From a board of protocol 4, 208 bytes."""
 
 HELLO = struct.Struct("<HH")  # protocol, session
 ANSWER = struct.Struct("<HB")  # session, boards that are connected, a bit each
+ANSWER_4 = struct.Struct("<HHB")  # protocol, session, boards; also to a HELLO of another protocol
 
 _TURN = 2 * np.pi
 _KRPM = _TURN * 1000 / 60  # rad/s
@@ -205,9 +214,9 @@ class Solo8(Link):
         self._damping = np.full(len(MOTORS), damping)
         self._wire.setblocking(False)
         self._session: int | None = None
-        self._begun = 0
-        self._answered = self._calibrated = False
-        self._count = 0
+        self._protocol: int | None = None  # that of the answer
+        self._begun = self._count = 0
+        self._calibrated = False
         self._index: int | None = None
         self._status = np.zeros(BOARDS, np.uint16)
         self._position = np.zeros(len(MOTORS))
@@ -218,11 +227,11 @@ class Solo8(Link):
         """See Link."""
         newest = None
         for payload in self._payloads():
-            if len(payload) == ANSWER.size and self._session is not None:
-                self._answered |= ANSWER.unpack(payload)[0] == self._session
-            elif len(payload) == SENSOR.itemsize:
-                sensor = np.frombuffer(payload, SENSOR)[0]
-                if self._answered and sensor["session"] == self._session and self._is_newer(sensor):
+            self._hear_answer(payload)
+            kind = SENSOR if self._protocol == 3 else SENSOR_4
+            if self._protocol is not None and len(payload) == kind.itemsize:
+                sensor = np.frombuffer(payload, kind)[0]
+                if sensor["session"] == self._session and self._is_newer(sensor):
                     newest, self._index = sensor, int(sensor["index"])
         if newest is None:
             return False
@@ -231,7 +240,7 @@ class Solo8(Link):
 
     def send(self, mode: Mode, order: np.ndarray, now: int) -> None:
         """See Link."""
-        if not self._answered:
+        if self._protocol is None:
             self._greet(now)
             return
         command = self._command(mode, order, now)
@@ -260,15 +269,31 @@ class Solo8(Link):
             return
 
     def _greet(self, now: int) -> None:
-        """Ask the board to begin a session; its number is one that no earlier session has."""
+        """Ask the board to begin a session, in each protocol by turns.
+
+        A board refuses the other one, in protocol 4 by an answer, so that each has a session
+        number of its own, one that no session before has had.
+        """
         if self._session is None:
-            self._session, self._begun = 1 + (now // 1_000_000) % 65535, now
+            self._session, self._begun = 1 + (now // 1_000_000) % 65534, now
         if now - self._begun > GREETING * NANO:
+            known = " or ".join(str(protocol) for protocol in PROTOCOLS)
             raise LinkError(
-                f"the master board does not answer on this interface in protocol {PROTOCOL}: is it "
-                "on, is the cable in, and is its firmware of master-board 1.0?"
+                f"the master board does not answer on this interface in protocol {known}: is it "
+                "on, and is the cable in?"
             )
-        self._put(HELLO.pack(PROTOCOL, self._session))
+        place = self._count % len(PROTOCOLS)
+        self._put(HELLO.pack(PROTOCOLS[place], self._session + place))
+        self._count += 1
+
+    def _hear_answer(self, payload: bytes) -> None:
+        """Learn which protocol the board speaks, and go on in its session."""
+        if self._session is None or self._protocol is not None:
+            return
+        if len(payload) == ANSWER.size and ANSWER.unpack(payload)[0] == self._session:
+            self._protocol = 3
+        elif payload[:4] == HELLO.pack(4, self._session + 1) and len(payload) == ANSWER_4.size:
+            self._protocol, self._session = 4, self._session + 1
 
     def _is_newer(self, sensor: np.ndarray) -> bool:
         return self._index is None or 0 < (int(sensor["index"]) - self._index) % 2**16 < 2**15

@@ -7,7 +7,7 @@ import struct
 
 import numpy as np
 import pytest
-from electronics import WORLDS, calibrate_hung_up
+from electronics import WORLDS, calibrate_hung_up, solo8_world
 from rig import Rig
 
 from kiras_rl.deploy.runtime import go1, solo8
@@ -124,6 +124,7 @@ def test_a_port_that_is_taken_is_one_line():
 def test_solo8_s_messages_have_the_maker_s_sizes():
     assert (solo8.COMMAND.itemsize, solo8.SENSOR.itemsize) == (172, 200)
     assert (solo8.HELLO.size, solo8.ANSWER.size) == (4, 3)
+    assert (solo8.SENSOR_4.itemsize, solo8.ANSWER_4.size) == (208, 5)
 
 
 def test_a_command_to_solo8_byte_for_byte():
@@ -190,28 +191,81 @@ def test_a_board_that_does_not_answer_is_one_line(order):
             link.send(Mode.OFF, order, 3 * 10**9)
 
 
-def test_sensors_that_are_older_or_of_another_session_do_not_count(order):
+ANSWERS = {3: (1001, solo8.ANSWER.pack(1001, 15)), 4: (1002, solo8.ANSWER_4.pack(4, 1002, 15))}
+"""Session and answer of a board, by its protocol, to somebody who greets it at 1 s."""
+KINDS = {3: solo8.SENSOR, 4: solo8.SENSOR_4}
+
+
+@pytest.mark.parametrize("protocol", [3, 4])
+def test_sensors_that_are_older_or_of_another_session_do_not_count(order, protocol):
+    session, answer = ANSWERS[protocol]
     own, other = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
     with own, other:
         link = solo8.Solo8(own, np.zeros(8), np.ones(8), 0.2)
         reading = make_reading()
         link.send(Mode.OFF, order, 10**9)
-        other.send(solo8.frame(solo8.ANSWER.pack(1001, 15)))
+        other.send(solo8.frame(answer))
         assert not link.receive(reading, 10**9)
 
-        def arrives(session, index):
-            sensor = np.zeros((), solo8.SENSOR)
+        def arrives(session, index, kind=KINDS[protocol]):
+            sensor = np.zeros((), kind)
             sensor["session"], sensor["index"] = session, index
             sensor["acc"] = 0, 0, 2048
             other.send(solo8.frame(sensor.tobytes()))
             return link.receive(reading, 10**9)
 
-        assert arrives(1001, 65535)
+        assert arrives(session, 65535)
         assert reading["acc"] == pytest.approx([0.0, 0.0, 9.80665])
-        assert not arrives(1001, 65535)
-        assert not arrives(1001, 65500)
-        assert not arrives(1002, 0)
-        assert arrives(1001, 0)
+        assert not arrives(session, 65535)
+        assert not arrives(session, 65500)
+        assert not arrives(session + 1, 0)
+        assert not arrives(session, 0, KINDS[7 - protocol])
+        assert arrives(session, 0)
+
+
+def test_a_measurement_in_protocol_4_byte_for_byte(order):
+    own, other = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
+    motors = struct.pack("<HHii4h4H", 1 << 13, 0, 2**24, -(2**24), 0, 0, 1024, 0, 0, 0, 0, 0)
+    imu = struct.pack("<12h", 0, 0, 2048, 0, 0, -2048, 0, 0, 0, 9, 9, 9)
+    power = struct.pack("<Hhf", 7680, 800, 1.5)  # 24 V, 1 A
+    payload = struct.pack("<H", 1002) + 6 * motors + imu + power + struct.pack("<HHH", 5, 0, 0)
+    with own, other:
+        link = solo8.Solo8(own, np.zeros(8), np.ones(8), 0.2)
+        reading = make_reading()
+        link.send(Mode.OFF, order, 10**9)
+        other.send(solo8.frame(solo8.ANSWER_4.pack(4, 1002, 15)))
+        other.send(solo8.frame(payload))
+        assert link.receive(reading, 10**9)
+        link.send(Mode.OFF, order, 10**9)
+        sent = [solo8.payload_of(other.recv(2048)) for _ in range(2)]
+    turn = 2 * np.pi / 9  # of the joint, for one of the motor
+    expected = turn * solo8.SIGNS * np.where(solo8.MOTORS % 2, -1, 1)
+    assert reading["joint_pos"][:8] == pytest.approx(expected)
+    assert reading["gyro"] == pytest.approx([0.0, 0.0, -1.0])
+    assert reading["acc"] == pytest.approx([0.0, 0.0, 9.80665])
+    assert len(sent[1]) == 172
+    assert sent[1][:2] == struct.pack("<H", 1002)
+
+
+def test_a_board_of_protocol_4_that_refuses_protocol_3_is_asked_in_its_own(order):
+    own, other = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
+    with own, other:
+        link = solo8.Solo8(own, np.zeros(8), np.ones(8), 0.2)
+        link.send(Mode.OFF, order, 10**9)
+        other.send(solo8.frame(solo8.ANSWER_4.pack(4, 1001, 15)))  # no session has begun
+        link.receive(make_reading(), 10**9)
+        link.send(Mode.OFF, order, 10**9)
+        greetings = [solo8.payload_of(other.recv(2048)) for _ in range(2)]
+        assert greetings == [solo8.HELLO.pack(3, 1001), solo8.HELLO.pack(4, 1002)]
+
+
+def test_a_solo8_of_protocol_4_finds_its_zeros(tmp_path):
+    rig = Rig("solo8", tmp_path, world=lambda rig: solo8_world(rig, protocol=4))
+    calibrate_hung_up(rig)
+    assert rig.electronics.state == "active"
+    reading = rig.channel.readings.get()
+    assert reading["joint_pos"][:8] == pytest.approx(rig.plant.data.qpos[7:], abs=0.15)
+    rig.electronics.close()
 
 
 @pytest.mark.parametrize("text", ["", "[1, 2]", "{", "[1,2,3,4,5,6,7,null]"])
