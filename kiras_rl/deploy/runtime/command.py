@@ -71,6 +71,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--calibration", default="", metavar="FILE", help="Solo-8: angles at the encoders' index")
     add("--keyboard", action="store_true", help="take the keyboard, though there is a gamepad")
     add("--deadman", action="store_true", help="commands count while RB or R1 is held")
+    add("--guest", action="store_true", help="let examples/ros2 steer while sticks and keys rest")
     add("--script", metavar="TEXT", help="instead of a hand: on,stand,walk:4:0.3,crawl:4,lie,quit")
     add("--out", type=Path, default=Path("robot_logs"), metavar="FOLDER", help="for logs")
     add("--seed", type=int, default=0, help="--sim: of how the robot lies, and of its noise (0)")
@@ -144,7 +145,8 @@ class Session:
         for seat in (self._channel.driver, self._channel.runtime):
             if seat.is_taken():
                 seat.take()  # raises, and says who has it
-        for box in (self._channel.readings, self._channel.orders, self._channel.wishes):
+        channel = self._channel
+        for box in (channel.readings, channel.orders, channel.wishes, channel.guests):
             box.clear()
         self._folder = options.out / time.strftime("%Y-%m-%d_%H-%M-%S")
         self._folder.mkdir(parents=True, exist_ok=True)
@@ -158,7 +160,7 @@ class Session:
             seed=options.seed,
             root=str(root),
         )
-        self._by_keyboard = options.keyboard
+        self._by_keyboard, self._has_guest = options.keyboard, options.guest
         self._hand = Hand(self._meta)
         self._remote: Remote | None = None
         self._interrupts = self._saved = self._faults = 0
@@ -175,10 +177,10 @@ class Session:
             with ExitStack() as stack:
                 device = self._device(stack)
                 print(f"{self._meta.robot}: events and black boxes in {self._folder}")
-                print(device.help)
-                self._children = {role: self._start(role) for role in ROLES}
                 if self._meta.onboard is None:
                     print(f"checks by the numbers of {source_of(self._meta)}")
+                print(device.help)
+                self._children = {role: self._start(role) for role in ROLES}
                 keep_pace(lambda now: self._tick(device, now), _RATE)
         finally:
             signal.signal(signal.SIGINT, before)
@@ -220,7 +222,8 @@ class Session:
         connected = device.poll(self._hand, now)
         if self._remote is not None and reading is not None:
             connected |= self._remote.take(self._hand, reading["remote"].tobytes())
-        wish = self._hand.wish(now, connected)
+        guest = self._channel.guests.get() if self._has_guest else None
+        wish = self._hand.wish(now, connected, guest)
         self._channel.wishes.put(wish)
         if int(wish["requests"]) != self._requests and wish["request"] == Request.SAVE:
             self._save()

@@ -13,7 +13,16 @@ import numpy as np
 from kiras_rl.deploy.runtime.blackbox import Ring
 from kiras_rl.deploy.runtime.guard import Guard
 from kiras_rl.deploy.runtime.mailbox import SHARED, Mailbox, Seat
-from kiras_rl.deploy.runtime.messages import NANO, ORDER, READING, WISH, Flag, Mode, make_reading
+from kiras_rl.deploy.runtime.messages import (
+    GUEST,
+    NANO,
+    ORDER,
+    READING,
+    WISH,
+    Flag,
+    Mode,
+    make_reading,
+)
 from kiras_rl.deploy.runtime.pace import Pace
 
 ALONE = 30.0  # s that a driver goes on damping after its runtime has ended
@@ -67,6 +76,7 @@ class Channel:
         self.readings = Mailbox(self.folder / "readings", READING)
         self.orders = Mailbox(self.folder / "orders", ORDER)
         self.wishes = Mailbox(self.folder / "wishes", WISH)
+        self.guests = Mailbox(self.folder / "guests", GUEST)
         self.driver = Seat(self.folder / "driver.seat")
         self.runtime = Seat(self.folder / "runtime.seat")
         self.operator = Seat(self.folder / "operator.seat")

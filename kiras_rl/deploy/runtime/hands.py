@@ -18,6 +18,9 @@ from kiras_rl.deploy.runtime.messages import NANO, WISH, Request
 
 DEAD = 0.12  # of a stick's full deflection: where sticks come to rest
 
+HANDOVER = 2.0  # s that a hand's own sticks rest before a guest's velocities count
+FORGOTTEN = 0.25  # s that a guest's velocities count
+
 # What a button or key does: a request, or one of these.
 EMERGENCY, HELD, NEXT, PREVIOUS, STOP = "emergency", "held", "next", "previous", "stop"
 FORWARD, LEFT, TURN = range(3)
@@ -86,7 +89,7 @@ class Hand:
         self._range = np.array([ranges.lin_vel_x, ranges.lin_vel_y, ranges.ang_vel_z])
         self._skills = len(metadata.skills)
         self._wish = np.zeros((), WISH)
-        self._command = np.zeros(3)
+        self._command, self._steered = np.zeros(3), 0  # and when it was last not zero, ns
         self._down: set[object] = set()
 
     @property
@@ -127,14 +130,30 @@ class Hand:
         """Set the whole command: v_x, v_y in m/s, yaw rate in rad/s."""
         self._command[:] = command
 
-    def wish(self, now: int, connected: bool) -> np.ndarray:
-        """Return the WISH of a moment, ns, shape ()."""
+    def wish(self, now: int, connected: bool, guest: np.ndarray | None = None) -> np.ndarray:
+        """Return the WISH of a moment, shape ().
+
+        Args:
+            now: ns.
+            connected: Whether there is something in the hand.
+            guest: The newest GUEST, whose velocities count while the hand's own have been zero for
+                HANDOVER; None if there is none.
+        """
         wish = self._wish
         wish["seq"] += 1
         wish["time"], wish["connected"] = now, connected
         wish["emergency"], wish["held"] = EMERGENCY in self._down, HELD in self._down
         wish["command"] = self._command if connected else 0.0
+        if connected and guest is not None and self._rests(now):
+            age = (now - int(guest["time"])) / NANO
+            if 0 <= age <= FORGOTTEN and np.isfinite(guest["command"]).all():
+                wish["command"] = guest["command"]
         return wish
+
+    def _rests(self, now: int) -> bool:
+        if self._command.any():
+            self._steered = now
+        return now - self._steered > HANDOVER * NANO
 
 
 class Gamepad:

@@ -130,6 +130,16 @@ WISH = np.dtype(
 """From operator to runtime and driver, fifty times a second."""
 
 
+GUEST = np.dtype(
+    [
+        ("seq", "<u8"),  # from 1
+        ("time", "<i8"),  # ns
+        ("command", "<f4", 3),  # v_x, v_y in m/s, yaw rate in rad/s, base frame
+    ]
+)
+"""From another program to the operator, which drives by it while its own hands rest."""
+
+
 def make_reading() -> np.ndarray:
     """Return an empty reading: level, at rest, temperatures and battery not measured. Shape ()."""
     reading = np.zeros((), READING)

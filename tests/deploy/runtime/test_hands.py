@@ -5,10 +5,11 @@ from __future__ import annotations
 import os
 import struct
 
+import numpy as np
 import pytest
 
 from kiras_rl.deploy.runtime.hands import Gamepad, Hand, Keyboard, Remote, remote_emergency
-from kiras_rl.deploy.runtime.messages import NANO, Request, State
+from kiras_rl.deploy.runtime.messages import GUEST, NANO, Request, State
 from kiras_rl.deploy.runtime.scripts import ScriptError, parse_script
 
 A, B, X, Y, RB, START = 0, 1, 2, 3, 5, 7
@@ -53,6 +54,47 @@ def test_a_gamepad_s_sticks_are_shares_of_the_range(tmp_path, hand):
     assert hand.wish(2, True)["command"] == pytest.approx([-0.3, 0.0, 0.3], abs=1e-4)
     pad.say(hand, AXIS, 1, 3000)  # where sticks come to rest
     assert hand.wish(3, True)["command"][0] == 0.0
+
+
+def guest_says(time, command):
+    guest = np.zeros((), GUEST)
+    guest["time"], guest["command"] = time, command
+    return guest
+
+
+def test_a_guest_steers_while_the_hand_rests(hand):
+    start = 10 * NANO
+    assert hand.wish(start, True, guest_says(start, (0.2, 0.0, 0.1)))["command"] == pytest.approx(
+        [0.2, 0.0, 0.1]
+    )
+    hand.set_command((0.5, 0.0, 0.0))
+    assert hand.wish(start, True, guest_says(start, (0.2, 0.0, 0.1)))["command"][0] == 0.5
+    hand.set_command((0.0, 0.0, 0.0))
+    for seconds, expected in ((0.1, 0.0), (1.9, 0.0), (2.1, 0.2)):  # HANDOVER is 2 s
+        now = start + round(seconds * NANO)
+        wish = hand.wish(now, True, guest_says(now, (0.2, 0.0, 0.1)))
+        assert wish["command"][0] == pytest.approx(expected)
+
+
+@pytest.mark.parametrize(
+    ("age", "command", "connected"),
+    [
+        (0.3, (0.2, 0.0, 0.0), True),  # FORGOTTEN is 0.25 s
+        (-0.1, (0.2, 0.0, 0.0), True),
+        (0.0, (float("nan"), 0.0, 0.0), True),
+        (0.0, (0.2, 0.0, 0.0), False),  # nobody is there who could stop it
+    ],
+)
+def test_a_guest_that_does_not_count(hand, age, command, connected):
+    now = 10 * NANO
+    guest = guest_says(now - round(age * NANO), command)
+    assert (hand.wish(now, connected, guest)["command"] == 0.0).all()
+
+
+def test_a_guest_presses_no_buttons(hand):
+    hand.press(Request.LIE)
+    wish = hand.wish(10 * NANO, True, guest_says(10 * NANO, (0.2, 0.0, 0.0)))
+    assert (wish["request"], wish["requests"], wish["emergency"]) == (Request.LIE, 1, 0)
 
 
 def test_a_gamepad_s_buttons(tmp_path, hand):
