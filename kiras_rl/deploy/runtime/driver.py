@@ -184,8 +184,8 @@ def keep_pace(tick: Callable[[int], bool], rate: float) -> Pace:
     while not tick(now):
         due = max(due + period, time.monotonic_ns() - period)
         _sleep_until(due)
-        now = time.monotonic_ns()
-        pace.add(now - due)
+        before, now = now, time.monotonic_ns()
+        pace.add(now - due, now - before)
     return pace
 
 
