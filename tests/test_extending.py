@@ -100,7 +100,7 @@ def test_a_reward_may_remember_what_it_needs():
         stands = env.measure().foot_stands
         landing = stands & in_air
         expected = -0.2 * (falling * landing).sum(1).mean()
-        torch.testing.assert_close(extras["log"]["Reward/hard_landing"], expected)
+        torch.testing.assert_close(extras["log"]["Reward/landing_speed"], expected)
         landed += landing.sum()
         speed = (-env.robot.foot_vel_w[..., 2]).clamp(min=0.0)
         falling = torch.where(stands | dones[:, None], 0.0, speed)
