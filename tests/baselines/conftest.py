@@ -16,13 +16,15 @@ TINY = (
     "finetuning.env.terrain.variants=2",
 )
 
+SMALL = {"dreamwaq": (), "cassi": ("learner.parts.cassi.batch_size=64",)}
+
 
 @pytest.fixture
 def make_runner(tmp_path):
     """Return a function that builds a run from its configuration: what a new process does."""
 
     def make(cfg, run, *overrides, phase=SKILL_LEARNING):
-        config = load_config(f"baselines/{cfg}", [*TINY, *overrides])
+        config = load_config(f"baselines/{cfg}", [*TINY, *SMALL[cfg], *overrides])
         env = make_env(phase_config(config, phase))
         return KirasRunner(env, config, tmp_path / run, "cpu", phase=phase)
 
