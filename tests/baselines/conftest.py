@@ -16,7 +16,10 @@ TINY = (
     "finetuning.env.terrain.variants=2",
 )
 
-SMALL = {"dreamwaq": (), "cassi": ("learner.parts.cassi.batch_size=64",)}
+SMALL = {
+    "dreamwaq": (),
+    "cassi": ("learner.parts.cassi.batch_size=64", "learner.parts.cassi.updates=2"),
+}
 
 
 @pytest.fixture

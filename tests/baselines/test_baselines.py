@@ -7,6 +7,7 @@ import torch
 import yaml
 from states import differences
 
+from kiras_rl.algorithms.trainer import Trainer
 from kiras_rl.checkpoint import find_checkpoint, load_checkpoint, load_policy
 from kiras_rl.config import CFG_FOLDER, config_to_dict, load_config, read_keys
 from kiras_rl.deploy.policy import OnboardPolicy
@@ -91,6 +92,24 @@ def test_a_training_resumed_in_both_phases_ends_with_the_same_bits(cfg, make_run
     for one, other in pairs:
         for part in ("learner", "env", "generators", "policy"):
             assert differences(one[part], other[part], part) == []
+
+
+@pytest.mark.parametrize("cfg", BASELINES)
+def test_replayed_rollouts_and_updates_are_the_same(cfg, make_runner, taped):
+    def train(recorded):
+        torch.manual_seed(2)
+        runner = make_runner(cfg, str(recorded), "learner.ppo.num_steps=6")
+        parts = runner.alg.parts.values()
+        trainers = [x for part in parts for x in vars(part).values() if isinstance(x, Trainer)]
+        graphs = [runner.alg._rollout._act, runner.alg._rollout._store]
+        graphs += [trainer._pass for trainer in (runner.alg.trainer, *trainers)]
+        for graph in graphs:
+            graph.records = recorded
+        runner.learn(3)
+        assert all((graph._recording is not None) == recorded for graph in graphs)
+        return runner.alg.save()
+
+    assert differences(train(False), train(True)) == []
 
 
 @pytest.mark.parametrize("cfg", BASELINES)
