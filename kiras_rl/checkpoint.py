@@ -11,6 +11,7 @@ from pathlib import Path
 import torch
 
 from kiras_rl import __version__, distributed
+from kiras_rl.config import ConfigError
 from kiras_rl.files import CheckedFile, replacing
 from kiras_rl.models.exported import ExportedPolicy, build_policy
 
@@ -161,10 +162,13 @@ def load_policy(path: Path) -> tuple[ExportedPolicy, dict]:
         The policy, and its description as kiras_rl.deploy.metadata.PolicyMetadata spells it.
 
     Raises:
-        CheckpointError: As `load_checkpoint`.
+        CheckpointError: As `load_checkpoint`, or an estimator of a class that cannot be found.
     """
     content = load_checkpoint(path)
-    policy = build_policy(content["policy_shape"])
+    try:
+        policy = build_policy(content["policy_shape"])
+    except ConfigError as error:
+        raise CheckpointError(f"{path}: {error}") from None
     policy.load_state_dict(content["policy"])
     return policy.eval(), content["description"]
 

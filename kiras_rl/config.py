@@ -8,15 +8,18 @@ from collections.abc import Iterable
 from dataclasses import asdict
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from kiras_rl.files import replacing
+from kiras_rl.limits import find_outside_fields
 from kiras_rl.ranges import find_mistake
 from kiras_rl.schema import Config
 from kiras_rl.yaml_files import YamlError, read_yaml_file, read_yaml_text
+
+T = TypeVar("T")
 
 CFG_FOLDER = Path(__file__).resolve().parent / "cfg"
 if not CFG_FOLDER.is_dir():  # an editable install: kiras_rl.cfg is the top-level folder cfg/
@@ -97,6 +100,32 @@ def config_from_layers(layers: list[dict], source: str) -> Config:
         ConfigError: As `load_config`.
     """
     return _resolve(layers, [], source)
+
+
+def read_block(where: str, kind: type[T], values: dict) -> T:
+    """Return a block whose keys the schema does not know, typed by a dataclass.
+
+    Args:
+        where: Its key in the configuration.
+        kind: The dataclass; a field may be `limited`.
+        values: What the configuration says.
+
+    Raises:
+        ConfigError: Unknown key, wrong type, missing value, or a number outside of its range.
+    """
+    begin, layer = OmegaConf.structured(kind), OmegaConf.create(values)
+    _check_keys(begin, layer, where, f"{where}.")
+    try:
+        block = OmegaConf.unsafe_merge(begin, layer)
+        missing = sorted(OmegaConf.missing_keys(block))
+        result: Any = None if missing else OmegaConf.to_object(block)
+    except OmegaConfBaseException as error:
+        raise ConfigError(_explain(error, where)) from None
+    if missing:
+        raise ConfigError(f"{where} leaves out: {', '.join(missing)}")
+    if mistake := find_outside_fields(result, where):
+        raise ConfigError(mistake)
+    return result
 
 
 def config_to_dict(config: Config) -> dict:

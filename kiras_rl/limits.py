@@ -6,7 +6,7 @@ Of a list every number is in the range; of a schedule, [fraction, value] points,
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 LARGEST = 1e9
@@ -187,6 +187,12 @@ PARAMETERS = {
 
 _ANY = Limits(-LARGEST, LARGEST)
 
+
+def limited(low: float, high: float, above: bool = False) -> dict[str, Limits]:
+    """Return the metadata of a dataclass field that holds numbers within limits."""
+    return {"limits": Limits(low, high, above)}
+
+
 SCHEDULES = (
     "env.rewards.penalty_scale",
     "env.randomized_share",
@@ -205,6 +211,22 @@ def find_outside(values: dict) -> str | None:
         values: Nested plain values; what is null is not looked at.
     """
     return next(_outside(values), None)
+
+
+def find_outside_fields(block: Any, where: str) -> str | None:
+    """Return which field of a dataclass is outside of its `limited` range, or None.
+
+    Args:
+        block: Its fields hold numbers, or lists of them, where they are limited.
+        where: The key of the configuration that holds the block.
+    """
+    for field in fields(block):
+        if limits := field.metadata.get("limits"):
+            value = getattr(block, field.name)
+            found = _check(f"{where}.{field.name}", value, _numbers(value), limits)
+            if problem := next(found, None):
+                return problem
+    return None
 
 
 def _outside(values: dict, prefix: str = "") -> Iterator[str]:

@@ -145,6 +145,18 @@ def test_a_policy_is_rebuilt_from_its_shape(path, make_metadata, make_policy):
         assert torch.equal(mine, its)
 
 
+def test_an_estimator_of_an_unknown_class_is_refused_in_one_line(path, make_metadata, make_policy):
+    policy = make_policy(make_metadata())
+    shape = policy.shape()
+    shape["estimator"]["class_name"] = "nowhere.at_all:Estimator"
+    content = {"policy_shape": shape, "policy": policy.state_dict(), "description": {}}
+    save_checkpoint(path, {"learner": {}} | content)
+    with pytest.raises(CheckpointError) as caught:
+        checkpoint.load_policy(path)
+    assert str(caught.value).startswith(f"{path}: policy_shape.estimator.class_name=nowhere.at_all")
+    assert "\n" not in str(caught.value)
+
+
 def test_what_the_disk_does_not_give_back_is_found_when_it_is_written(saved, monkeypatch):
     before = saved.read_bytes()
     sync = os.fsync

@@ -40,10 +40,12 @@ def test_every_package_has_an_init_file():
     assert not missing
 
 
-@pytest.mark.parametrize("package", ["kiras_rl.robots", "kiras_rl.cfg", "kiras_rl.tools.viewer"])
+@pytest.mark.parametrize(
+    "package", ["kiras_rl.robots", "kiras_rl.cfg", "kiras_rl.tools.viewer", "kiras_rl.baselines"]
+)
 def test_every_data_file_is_covered_by_a_pattern(package):
     top, _, inner = package.removeprefix("kiras_rl.").partition(".")
-    folder = FOLDERS[f"kiras_rl.{top}"] / inner
+    folder = FOLDERS.get(f"kiras_rl.{top}", FOLDERS["kiras_rl"] / top) / inner
     covered = {path for glob in SETUPTOOLS["package-data"][package] for path in folder.glob(glob)}
     data = {
         path

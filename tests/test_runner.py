@@ -10,7 +10,7 @@ from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
-import torch
+from states import differences
 from tensorboard.summary.writer import event_file_writer
 
 from kiras_rl.checkpoint import CheckpointError, load_checkpoint, save_checkpoint
@@ -72,21 +72,6 @@ def tell():
 
 def latest(runner):
     return runner.run_dir / "checkpoints" / "latest.pt"
-
-
-def differences(a, b, path=""):
-    """List where two nested states differ."""
-    if isinstance(a, dict):
-        assert a.keys() == b.keys(), path
-        return [d for key in a for d in differences(a[key], b[key], f"{path}/{key}")]
-    if isinstance(a, list | tuple):
-        assert len(a) == len(b), path
-        return [d for i, pair in enumerate(zip(a, b, strict=True))
-                for d in differences(*pair, f"{path}/{i}")]  # fmt: skip
-    if isinstance(a, torch.Tensor):
-        same = a.dtype == b.dtype and torch.equal(torch.nan_to_num(a), torch.nan_to_num(b))
-        return [] if same else [path]
-    return [] if a == b else [path]
 
 
 def test_the_log_holds_both_phases_whatever_its_files_are_called(make_runner, monkeypatch):

@@ -15,7 +15,7 @@ from kiras_rl.algorithms.part import Iteration, Outcome, Part, Setting
 from kiras_rl.algorithms.storage import GroupRolloutStorage, mini_batches
 from kiras_rl.algorithms.trainer import Trainer
 from kiras_rl.config import ConfigError
-from kiras_rl.models.estimator import VELOCITY_DIM, ContextEstimator
+from kiras_rl.models.estimator import VELOCITY_DIM, ContextEstimator, Estimator
 from kiras_rl.schema import EstimatorConfig
 from kiras_rl.shards import Batch
 
@@ -28,7 +28,7 @@ class Estimation(Part):
     def __init__(
         self,
         config: EstimatorConfig,
-        estimator: ContextEstimator,
+        estimator: Estimator,
         num_envs: int,
         device: str,
     ) -> None:
@@ -92,7 +92,7 @@ class Estimation(Part):
 
         With AdaBoot on the input, worlds that do not trust the estimate are told the true velocity.
         """
-        context = self.estimator.context(obs[names.HISTORY])
+        context = self.estimator.context(self.estimator.frames(obs))
         if self.adaboot.bootstraps_input:
             told = self.adaboot.uses_estimate[:, None]
             velocity = torch.where(told, context[:, :VELOCITY_DIM], obs[names.VELOCITY])
@@ -125,7 +125,7 @@ class Estimation(Part):
         obs = rollout.observations
         rollout.shuffle_into(
             self._data,
-            history=obs[names.HISTORY],
+            frames=self.estimator.frames(obs),
             velocity=obs[names.VELOCITY],
             target=obs[names.NEXT_PROPRIO],
             skill=obs[names.SKILL],
@@ -151,7 +151,7 @@ class Estimation(Part):
 
     def _losses(
         self,
-        history: torch.Tensor,
+        frames: torch.Tensor,
         velocity: torch.Tensor,
         target: torch.Tensor,
         skill: torch.Tensor,
@@ -159,8 +159,9 @@ class Estimation(Part):
         target_weight: torch.Tensor,
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
         """Return errors of velocity ((m/s)^2) and prediction, KL to the prior, KL of the prior."""
-        estimate, mean, log_var = self.estimator(history)
-        prediction = self.estimator.decode(mean + noise * torch.exp(0.5 * log_var), skill)
+        estimate, mean, log_var = self.estimator(frames)
+        latent = mean + noise * torch.exp(0.5 * log_var)
+        prediction = self.estimator.decode(estimate, latent, skill)
         prior_mean, prior_log_var = self.estimator.prior_of(skill)
         zero = torch.zeros_like(prior_mean)
         return (
@@ -178,7 +179,7 @@ class Estimation(Part):
         """Return the estimator."""
         return self.networks()
 
-    def onboard(self) -> ContextEstimator:
+    def onboard(self) -> Estimator:
         """Return the estimator."""
         return self.estimator
 

@@ -22,7 +22,7 @@ from kiras_rl.shards import Batch
 
 if TYPE_CHECKING:
     from kiras_rl.algorithms.storage import GroupRolloutStorage
-    from kiras_rl.models.estimator import ContextEstimator
+    from kiras_rl.models.estimator import Estimator
     from kiras_rl.models.exported import ExportedPolicy
 
 
@@ -86,6 +86,10 @@ class Iteration:
 class Part:
     """A part that does nothing; see the module."""
 
+    settings: ClassVar[type | None] = None
+    """Dataclass of the keys that its block in `learner.parts` has beside `class_name`; None for a
+    part that reads its block itself."""
+
     reward_group: ClassVar[str | None] = None
     """Name of the reward that `rewards` returns, which gets a critic of its own."""
 
@@ -97,7 +101,7 @@ class Part:
 
     @classmethod
     def build(cls, config: Any, setting: Setting) -> Part:
-        """Build from a block of the configuration.
+        """Build from a block of the configuration, as `settings` types it.
 
         Raises:
             ConfigError: A value that is not allowed.
@@ -169,8 +173,8 @@ class Part:
         """Return the networks that go on into the next phase."""
         return {}
 
-    def onboard(self) -> ContextEstimator | None:
-        """Return the network that the robot needs: history -> velocity, mean, log variance."""
+    def onboard(self) -> Estimator | None:
+        """Return the network that the robot needs beside the actor."""
         return None
 
     def begin_from(self, networks: dict[str, dict], state: dict) -> None:

@@ -14,7 +14,7 @@ from kiras_rl.algorithms.part import Part, Setting
 from kiras_rl.algorithms.residual import Reference
 from kiras_rl.algorithms.storage import GroupRolloutStorage
 from kiras_rl.classes import find_class
-from kiras_rl.config import ConfigError
+from kiras_rl.config import ConfigError, read_block
 from kiras_rl.imitation.self_imitation import SelfImitation
 from kiras_rl.interfaces import SkillEnv
 from kiras_rl.models.actor import Actor
@@ -111,6 +111,8 @@ def _build_parts(setting: Setting, retention: Any) -> Iterator[tuple[str, Part]]
 
 def _build_named(where: str, block: dict[str, Any], setting: Setting) -> Part:
     kind = find_class(f"{where}.class_name", block.pop("class_name", None), Part)
+    if kind.settings is not None:
+        return kind.build(read_block(where, kind.settings, block), setting)
     try:
         return kind.build(block, setting)
     except (TypeError, KeyError) as error:

@@ -1,18 +1,92 @@
-"""The environment context estimator (ECE): a skill-conditioned CVAE on the history."""
+"""Estimators: what a robot works out of the frames that it has seen.
+
+Letters: H past frames, P numbers a frame, F numbers of all frames that are read, Z latent numbers,
+S skills.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import torch
 from torch import nn
+
+from kiras_rl import interfaces as names
 
 VELOCITY_DIM = 3
 _LOG_VAR_RANGE = (-8.0, 4.0)
 
 
-class ContextEstimator(nn.Module):
-    """Encoder E(o_{t-H..t-1}) -> velocity, z; decoder (z, skill) -> o_{t+1}; prior p(z | skill).
+class Estimator(nn.Module):
+    """A variational auto-encoder of frames whose encoder the robot takes along.
 
-    Letters: H frames, P numbers a frame, Z latent numbers, S skills.
+    Encoder E(frames) -> velocity, q(z | frames). A subclass has the decoder, and keeps the
+    arguments of its constructor in `_shape`.
+    """
+
+    _shape: dict
+
+    def __init__(self, frames_dim: int, latent_dim: int, encoder_dims: list[int]) -> None:
+        """Build the encoder.
+
+        Args:
+            frames_dim: F.
+            latent_dim: Z.
+            encoder_dims: Widths.
+        """
+        super().__init__()
+        self.latent_dim = latent_dim
+        self.context_dim = VELOCITY_DIM + latent_dim
+        self.encoder = mlp(frames_dim, encoder_dims, VELOCITY_DIM + 2 * latent_dim)
+
+    def shape(self) -> dict:
+        """Return the name of the class and the constructor's arguments, as plain values."""
+        kind = type(self)
+        return {"class_name": f"{kind.__module__}:{kind.__qualname__}", **self._shape}
+
+    def frames(self, obs: Mapping[str, torch.Tensor]) -> torch.Tensor:
+        """Return what the encoder reads of `proprio` and `history`, (N, F): the past frames."""
+        return obs[names.HISTORY]
+
+    def forward(self, frames: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Encode frames (N, F).
+
+        Returns:
+            velocity: Base velocity in the base frame, (N, 3), m/s.
+            mean: Of q(z | frames), (N, Z).
+            log_var: Of q(z | frames), (N, Z).
+        """
+        sizes = [VELOCITY_DIM, self.latent_dim, self.latent_dim]
+        velocity, mean, log_var = self.encoder(frames).split(sizes, dim=-1)
+        return velocity, mean, log_var.clamp(*_LOG_VAR_RANGE)
+
+    def context(self, frames: torch.Tensor) -> torch.Tensor:
+        """Return what the actor sees: velocity and the latent mean, (N, 3 + Z)."""
+        velocity, mean, _ = self(frames)
+        return torch.cat([velocity, mean], dim=-1)
+
+    def decode(
+        self, velocity: torch.Tensor, latent: torch.Tensor, skill: torch.Tensor
+    ) -> torch.Tensor:
+        """Predict the next proprioception, (N, P).
+
+        Args:
+            velocity: What the encoder says of it, (N, 3), m/s.
+            latent: Drawn from q(z | frames), (N, Z).
+            skill: One-hot codes, (N, S).
+        """
+        raise NotImplementedError
+
+    def prior_of(self, skill: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return mean and log variance, (N, Z), of the prior for one-hot skills (N, S): N(0, I)."""
+        zero = skill.new_zeros(len(skill), self.latent_dim)
+        return zero, zero
+
+
+class ContextEstimator(Estimator):
+    """The environment context estimator (ECE): a skill-conditioned CVAE on the history.
+
+    Encoder E(o_{t-H..t-1}) -> velocity, z; decoder (z, skill) -> o_{t+1}; prior p(z | skill).
     """
 
     def __init__(
@@ -25,7 +99,7 @@ class ContextEstimator(nn.Module):
         decoder_dims: list[int],
     ) -> None:
         """Build encoder, decoder and prior; the prior starts as N(0, I)."""
-        super().__init__()
+        super().__init__(history_length * proprio_dim, latent_dim, encoder_dims)
         self._shape = {
             "proprio_dim": proprio_dim,
             "history_length": history_length,
@@ -34,36 +108,13 @@ class ContextEstimator(nn.Module):
             "encoder_dims": list(encoder_dims),
             "decoder_dims": list(decoder_dims),
         }
-        self.latent_dim = latent_dim
-        self.context_dim = VELOCITY_DIM + latent_dim
-        encoder_out = VELOCITY_DIM + 2 * latent_dim
-        self.encoder = _mlp(history_length * proprio_dim, encoder_dims, encoder_out)
-        self.decoder = _mlp(latent_dim + num_skills, decoder_dims, proprio_dim)
+        self.decoder = mlp(latent_dim + num_skills, decoder_dims, proprio_dim)
         self.prior = nn.Embedding(num_skills, 2 * latent_dim)
         nn.init.zeros_(self.prior.weight)
 
-    def shape(self) -> dict:
-        """Return the constructor's arguments."""
-        return dict(self._shape)
-
-    def forward(self, history: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Encode histories (N, H * P).
-
-        Returns:
-            velocity: Base velocity in the base frame, (N, 3), m/s.
-            mean: Of q(z | history), (N, Z).
-            log_var: Of q(z | history), (N, Z).
-        """
-        sizes = [VELOCITY_DIM, self.latent_dim, self.latent_dim]
-        velocity, mean, log_var = self.encoder(history).split(sizes, dim=-1)
-        return velocity, mean, log_var.clamp(*_LOG_VAR_RANGE)
-
-    def context(self, history: torch.Tensor) -> torch.Tensor:
-        """Return what the actor sees: velocity and the latent mean, (N, 3 + Z)."""
-        velocity, mean, _ = self(history)
-        return torch.cat([velocity, mean], dim=-1)
-
-    def decode(self, latent: torch.Tensor, skill: torch.Tensor) -> torch.Tensor:
+    def decode(
+        self, velocity: torch.Tensor, latent: torch.Tensor, skill: torch.Tensor
+    ) -> torch.Tensor:
         """Predict the next proprioception from latents (N, Z) and one-hot skills (N, S)."""
         return self.decoder(torch.cat([latent, skill], dim=-1))
 
@@ -73,7 +124,8 @@ class ContextEstimator(nn.Module):
         return mean, log_var.clamp(*_LOG_VAR_RANGE)
 
 
-def _mlp(inputs: int, hidden_dims: list[int], outputs: int) -> nn.Sequential:
+def mlp(inputs: int, hidden_dims: list[int], outputs: int) -> nn.Sequential:
+    """Return a network with ELU between its layers."""
     layers: list[nn.Module] = []
     for hidden in hidden_dims:
         layers += [nn.Linear(inputs, hidden), nn.ELU()]

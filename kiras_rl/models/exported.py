@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from rsl_rl.modules import MLP
 from torch import nn
 
-from kiras_rl.models.estimator import ContextEstimator
+from kiras_rl import interfaces as names
+from kiras_rl.classes import find_class
+from kiras_rl.models.estimator import ContextEstimator, Estimator
 
 
 class ExportedPolicy(nn.Module):
@@ -16,13 +20,13 @@ class ExportedPolicy(nn.Module):
     was trained with is computed inside, so that the exported file needs nothing but these two.
 
     Args:
-        estimator: Context estimator, history (N, H*P) -> velocity (N, 3) m/s, mean (N, Z), log
-            variance (N, Z); None for an actor that reads the history itself.
+        estimator: Frames that it chooses -> velocity (N, 3) m/s, mean (N, Z), log variance (N, Z);
+            None for an actor that reads the history itself.
         actor_mlp: Network on [proprio, velocity, mean], or on [proprio, history] without an
             estimator, to actions (N, J).
     """
 
-    def __init__(self, estimator: ContextEstimator | None, actor_mlp: nn.Module) -> None:
+    def __init__(self, estimator: Estimator | None, actor_mlp: nn.Module) -> None:
         """Keep both networks; their weights are shared with the caller, not copied."""
         super().__init__()
         self.estimator = estimator
@@ -44,7 +48,8 @@ class ExportedPolicy(nn.Module):
         if self.estimator is None:
             velocity = proprio.new_zeros(proprio.shape[0], 3)
             return self.actor(torch.cat([proprio, history], dim=-1)), velocity
-        velocity, mean, _ = self.estimator(history)
+        frames = self.estimator.frames({names.PROPRIO: proprio, names.HISTORY: history})
+        velocity, mean, _ = self.estimator(frames)
         return self.actor(torch.cat([proprio, velocity, mean], dim=-1)), velocity
 
     def shape(self) -> dict:
@@ -57,11 +62,23 @@ class ExportedPolicy(nn.Module):
 
 
 def build_policy(shape: dict) -> ExportedPolicy:
-    """Make a policy with random weights from `ExportedPolicy.shape`."""
-    estimator = None if shape["estimator"] is None else ContextEstimator(**shape["estimator"])
+    """Make a policy with random weights from `ExportedPolicy.shape`.
+
+    Raises:
+        ConfigError: An estimator of a class that cannot be found.
+    """
+    estimator = None if shape["estimator"] is None else _build_estimator(**shape["estimator"])
     sizes = [tuple(pair) for pair in shape["actor"]]
     actor = MLP(sizes[0][0], sizes[-1][1], [out for _, out in sizes[:-1]], "elu")
     return ExportedPolicy(estimator, actor)
+
+
+def _build_estimator(class_name: str | None = None, **shape: Any) -> Estimator:
+    """Make an estimator; what earlier versions saved names no class."""
+    kind = ContextEstimator
+    if class_name is not None:
+        kind = find_class("policy_shape.estimator.class_name", class_name, Estimator)
+    return kind(**shape)
 
 
 def _linears(module: nn.Module) -> list[nn.Linear]:

@@ -1,0 +1,1 @@
+"""Methods that KiRAS is compared with, each a part of the same learner in one file."""
