@@ -5,12 +5,14 @@ from __future__ import annotations
 import math
 import time
 from dataclasses import replace
+from functools import reduce
+from operator import or_
 
 import torch
 from tensordict import TensorDict
 
 from kiras_rl import interfaces as names
-from kiras_rl.envs import commands, curriculum, randomization, terminations
+from kiras_rl.envs import commands, curriculum, randomization
 from kiras_rl.envs.bounds import broken
 from kiras_rl.envs.commands import TaskSampler
 from kiras_rl.envs.curriculum import Curriculum
@@ -29,6 +31,7 @@ from kiras_rl.envs.rewards import RewardSum
 from kiras_rl.envs.sensing import Sensors
 from kiras_rl.envs.simulation.build import make_simulation
 from kiras_rl.envs.state import STANDING, Keyframes, Limits, RobotState, Step, Task
+from kiras_rl.envs.terminations import Terminations
 from kiras_rl.envs.terrain_library import build_library
 from kiras_rl.envs.terrains import CROSSED
 from kiras_rl.interfaces import Measurements, SkillEnv
@@ -126,7 +129,9 @@ class QuadrupedEnv(SkillEnv):
         self.imitation_terms = tuple(zip(phi.names, phi.sizes, phi.scales, strict=True))
         self._rewards = RewardSum(cfg.rewards, self.step_dt, self.device)
         feet = len(self.robot_cfg.foot_geoms)
-        self._memory = Memory(self._rewards.functions, self.num_envs, feet, self.device)
+        self._terminations = Terminations(cfg.terminations.terms)
+        terms = [*self._rewards.functions, *self._terminations.functions]
+        self._memory = Memory(terms, self.num_envs, feet, self.device)
         generator = torch.Generator(device=self.device)
         generator.manual_seed(seed)
         columns = {"joint": self.num_actions, "velocity": 2, NOISE: self._observer.proprio.size}
@@ -174,7 +179,9 @@ class QuadrupedEnv(SkillEnv):
         return slots
 
     def _begin(self) -> None:
-        self._judge(~self._all, ~self._all)  # a reward of a wrong shape is refused now
+        step = self._last_step(~self._all)
+        self._terminations(step)  # a term of a wrong shape is refused now
+        self._reward(step, ~self._all)
         self.reset()
         if self.cfg.terminations.random_first_length:
             # Otherwise all worlds time out together, and the data of a rollout is all alike.
@@ -219,15 +226,15 @@ class QuadrupedEnv(SkillEnv):
         self.robot.read_step()
         diverged = self.sim.diverged | broken(self.robot, self.keyframes, GRAVITY * self.mass)
         invalid = diverged | self.sim.overflowed
-        fallen = diverged | terminations.fallen(
-            self.robot, self.task, self.keyframes, self.cfg.terminations
-        )
+        step = self._last_step(diverged)
+        reasons = self._terminations(step)
+        step.fallen = fallen = reduce(or_, reasons, diverged)
         distance = self._distance()
         crossed = (distance > CROSSED) & (self._ground is not None)  # flat ground has no end
         # Memory that ran out is no fault of the policy's: the episode is cut.
         cut = self.sim.overflowed | crossed | (self._length >= self.max_episode_length)
         time_outs = cut & ~fallen
-        terms = self._judge(fallen, invalid)
+        terms = self._reward(step, invalid)
         observer, view = self._observer, self._view()
         extras = {
             names.EXTRA_TIME_OUTS: time_outs,
@@ -235,7 +242,7 @@ class QuadrupedEnv(SkillEnv):
             names.EXTRA_VALID: ~invalid,
             names.EXTRA_FLAT: self._is_flat,
             names.NEXT_PROPRIO: _unless(invalid, observer.proprio(view), observer.clean),
-            "log": self._log(terms, fallen, time_outs, diverged),
+            "log": self._log(terms, [fallen, time_outs, diverged, *reasons]),
         }
         self._measurements = measure(self.robot, self._limits, distance, fallen | invalid)
 
@@ -251,13 +258,10 @@ class QuadrupedEnv(SkillEnv):
         """Return how far bases are from the middle of their tile, max(|x|, |y|), (N,), m."""
         return self.robot.base_pos_w[:, :2].abs().amax(dim=1)
 
-    def _judge(self, fallen: torch.Tensor, invalid: torch.Tensor) -> torch.Tensor:
-        """Return the weighted reward terms, (N, terms).
-
-        A world whose physics broke has no meaningful terms; it earns nothing but the termination.
-        """
+    def _last_step(self, fallen: torch.Tensor) -> Step:
+        """Return the step that was just made, as terms see it."""
         command = self.task.command
-        step = Step(
+        return Step(
             stands=torch.linalg.vector_norm(command, dim=-1) < STANDING,
             robot=self.robot,
             task=self.task,
@@ -274,6 +278,12 @@ class QuadrupedEnv(SkillEnv):
             weight=GRAVITY * self.mass,
             dt=self.step_dt,
         )
+
+    def _reward(self, step: Step, invalid: torch.Tensor) -> torch.Tensor:
+        """Return the weighted reward terms, (N, terms), and remember the step.
+
+        A world whose physics broke has no meaningful terms; it earns nothing but the termination.
+        """
         terms = self._rewards(step)
         self._memory.advance(step)
         return terms.masked_fill(invalid[:, None] & ~self._rewards.is_termination, 0.0)
@@ -327,20 +337,16 @@ class QuadrupedEnv(SkillEnv):
     def _observe(self, begun: torch.Tensor) -> TensorDict:
         return self._observer.observe(self._view(), self._sensors, begun, self._random)
 
-    def _log(
-        self,
-        terms: torch.Tensor,
-        fallen: torch.Tensor,
-        time_outs: torch.Tensor,
-        diverged: torch.Tensor,
-    ) -> dict[str, torch.Tensor]:
+    def _log(self, terms: torch.Tensor, events: list[torch.Tensor]) -> dict[str, torch.Tensor]:
+        """Return means of the weighted terms (N, terms) and counts of events, (N,) bool each."""
         means = terms.mean(dim=0).unbind()
         log = {
             f"Reward/{name}": mean for name, mean in zip(self._rewards.names, means, strict=True)
         }
-        events = torch.stack([fallen, time_outs, diverged, self.sim.overflowed], dim=1)
-        counts = events.sum(dim=0, dtype=torch.float32).unbind()
-        log |= zip(_EVENTS, counts, strict=True)
+        reasons = [f"{names.ENDED_BY}{name}" for name in self._terminations.names]
+        happened = torch.stack([self.sim.overflowed, *events], dim=1)
+        counts = happened.sum(dim=0, dtype=torch.float32).unbind()
+        log |= zip([*_EVENTS, *reasons], counts, strict=True)
         return log | (self._curriculum.describe(self.skills) if self._curriculum else {})
 
     # --- the rest of SkillEnv -----------------------------------------------------------------
@@ -493,7 +499,7 @@ class QuadrupedEnv(SkillEnv):
         self.robot.read_kinematics()
 
 
-_EVENTS = ("Episode/falls", "Episode/time_outs", "Sim/diverged", "Sim/overflowed")
+_EVENTS = ("Sim/overflowed", names.FALLS, names.TIME_OUTS, "Sim/diverged")
 _BUFFERS = ("_length", "_action", "_last_joint_vel", "_last_joint_torque")
 
 

@@ -333,7 +333,8 @@ class Step:
         memory: What terms remember of the steps before.
         fresh: Worlds in the first step of an episode, (N,) bool; `delta_torques` is zero there,
             for there is no torque of a step before.
-        fallen: Worlds that terminate by failure, (N,) bool.
+        fallen: Worlds that terminate by failure, (N,) bool; to a termination, those whose physics
+            broke.
         weight: Of a robot before randomization, N.
         dt: Duration of the step, s.
     """

@@ -60,6 +60,13 @@ EXTRA_FLAT = "is_flat"
 """Worlds whose ground is flat, (N,) bool."""
 
 
+FALLS, TIME_OUTS = "Episode/falls", "Episode/time_outs"
+"""Tags of the log, under which episodes that end are counted."""
+
+ENDED_BY = "Episode/ended_by_"
+"""Begin of the tags under which falls are counted by their reason; the runner logs them as shares
+of all episodes that ended."""
+
 EXTRA_PHYSICS_TIME = "physics_time"
 """How long the physics backend kept the host, s, a number."""
 

@@ -68,12 +68,11 @@ class SkillConfig:
 
 @dataclass
 class TerminationConfig:
-    """Ends of an episode."""
+    """Ends of an episode; failures: name -> {parameters of the term}; null removes one."""
 
     episode_length: float
     random_first_length: bool
-    base_contact_force: float
-    max_tilt: float
+    terms: dict[str, Any]
 
 
 @dataclass

@@ -16,6 +16,7 @@ import torch
 ROOT = Path(__file__).parent.parent
 MAPPED = ("envs", "robots", "cfg", "tools")  # imported as kiras_rl.<folder>
 PAGE = (ROOT / "docs" / "extending.md").read_text(encoding="utf-8")
+SECTIONS = re.findall(r"^## (.+)$", PAGE, re.MULTILINE)
 DIFFS = re.findall(r"^```diff\n(.*?)^```", PAGE, re.MULTILINE | re.DOTALL)
 
 pytestmark = pytest.mark.skipif(shutil.which("git") is None, reason="needs git to apply diffs")
@@ -63,8 +64,14 @@ def make_env(name: str, *overrides: str):
 def test_there_is_one_diff_an_example(extended):
     import kiras_rl
 
-    assert len(DIFFS) == len(re.findall(r"^## ", PAGE, re.MULTILINE)) == 8
+    assert len(DIFFS) == len(SECTIONS)
     assert Path(kiras_rl.__file__).is_relative_to(extended)
+
+
+def test_the_table_counts_the_files_of_every_example():
+    rows = re.findall(r"^\| \[(.+?)\]\(#.+?\) \| (\d+) \|", PAGE, re.MULTILINE)
+    counted = zip(SECTIONS, (diff.count("diff --git") for diff in DIFFS), strict=True)
+    assert [(name, int(files)) for name, files in rows] == [(s.lower(), n) for s, n in counted]
 
 
 def test_a_skill_is_one_line():
@@ -106,6 +113,18 @@ def test_a_reward_may_remember_what_it_needs():
         falling = torch.where(stands | dones[:, None], 0.0, speed)
         in_air = ~stands & ~dones[:, None]
     assert landed > 5
+
+
+def test_a_termination_is_a_function_of_ones_own_and_a_line():
+    env, _ = make_env("solo8_knees", "env.terminations.random_first_length=false")
+    fell = 0
+    for _ in range(30):
+        _, _, dones, extras = env.step(6 * torch.randn(4, 8))
+        kneels = (env.robot.limb_force > 20.0).any(1)
+        assert extras["log"]["Episode/ended_by_knees"] == kneels.sum()
+        assert dones[kneels].all()
+        fell += kneels.sum()
+    assert fell > 0
 
 
 def test_an_observation_reaches_the_robot(tmp_path):
