@@ -56,6 +56,17 @@ def find_term(
     return _bind(function, entry, f"{where}.{name}", own)
 
 
+def find_terms(
+    module: Mapping[str, object], entries: Mapping[str, Any], first: type, where: str
+) -> dict[str, partial[Any]]:
+    """Return the functions of all entries that are not null, by name; see `find_term`."""
+    return {
+        name: find_term(module, name, entry, first, where)
+        for name, entry in entries.items()
+        if entry is not None
+    }
+
+
 def find_function(module: Mapping[str, object], name: str, first: type, where: str) -> Callable:
     """Return the public function `name` of a module whose first argument is of type `first`.
 

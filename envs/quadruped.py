@@ -15,6 +15,7 @@ from kiras_rl import interfaces as names
 from kiras_rl.envs import commands, curriculum, randomization
 from kiras_rl.envs.bounds import broken
 from kiras_rl.envs.commands import TaskSampler
+from kiras_rl.envs.constraints import Constraints
 from kiras_rl.envs.curriculum import Curriculum
 from kiras_rl.envs.description import describe_deployment
 from kiras_rl.envs.ground import Ground
@@ -131,6 +132,9 @@ class QuadrupedEnv(SkillEnv):
         feet = len(self.robot_cfg.foot_geoms)
         self._terminations = Terminations(cfg.terminations.terms)
         terms = [*self._rewards.functions, *self._terminations.functions]
+        self._constraints = Constraints(cfg.constraints)
+        self.constraints = self._constraints.names
+        terms += self._constraints.functions
         self._memory = Memory(terms, self.num_envs, feet, self.device)
         generator = torch.Generator(device=self.device)
         generator.manual_seed(seed)
@@ -181,6 +185,7 @@ class QuadrupedEnv(SkillEnv):
     def _begin(self) -> None:
         step = self._last_step(~self._all)
         self._terminations(step)  # a term of a wrong shape is refused now
+        self._violations(step, ~self._all)
         self._reward(step, ~self._all)
         self.reset()
         if self.cfg.terminations.random_first_length:
@@ -229,6 +234,7 @@ class QuadrupedEnv(SkillEnv):
         step = self._last_step(diverged)
         reasons = self._terminations(step)
         step.fallen = fallen = reduce(or_, reasons, diverged)
+        violations = self._violations(step, invalid)
         distance = self._distance()
         crossed = (distance > CROSSED) & (self._ground is not None)  # flat ground has no end
         # Memory that ran out is no fault of the policy's: the episode is cut.
@@ -243,6 +249,7 @@ class QuadrupedEnv(SkillEnv):
             names.EXTRA_FLAT: self._is_flat,
             names.NEXT_PROPRIO: _unless(invalid, observer.proprio(view), observer.clean),
             "log": self._log(terms, [fallen, time_outs, diverged, *reasons]),
+            **violations,
         }
         self._measurements = measure(self.robot, self._limits, distance, fallen | invalid)
 
@@ -278,6 +285,12 @@ class QuadrupedEnv(SkillEnv):
             weight=GRAVITY * self.mass,
             dt=self.step_dt,
         )
+
+    def _violations(self, step: Step, invalid: torch.Tensor) -> dict[str, torch.Tensor]:
+        """Return what a step adds to its extras where constraints are configured."""
+        if not self.constraints:
+            return {}
+        return {names.EXTRA_CONSTRAINTS: self._constraints(step).masked_fill(invalid[:, None], 0.0)}
 
     def _reward(self, step: Step, invalid: torch.Tensor) -> torch.Tensor:
         """Return the weighted reward terms, (N, terms), and remember the step.

@@ -10,7 +10,7 @@ from typing import Any
 
 import torch
 
-from kiras_rl.envs.lookup import find_term
+from kiras_rl.envs.lookup import find_terms
 from kiras_rl.envs.shapes import evaluate_mask
 from kiras_rl.envs.state import Step
 
@@ -44,11 +44,7 @@ class Terminations:
         Raises:
             ConfigError: Unknown reason or parameter, or a parameter that is no number.
         """
-        self._terms = {
-            name: find_term(globals(), name, entry, Step, _WHERE)
-            for name, entry in terms.items()
-            if entry is not None
-        }
+        self._terms = find_terms(globals(), terms, Step, _WHERE)
         self.names = list(self._terms)
         self.functions = [term.func for term in self._terms.values()]
 

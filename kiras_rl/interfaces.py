@@ -60,6 +60,10 @@ EXTRA_FLAT = "is_flat"
 """Worlds whose ground is flat, (N,) bool."""
 
 
+EXTRA_CONSTRAINTS = "constraints"
+"""How far each of `SkillEnv.constraints` is violated, (N, C), at least 0; 0 where physics broke.
+Missing where none is configured."""
+
 FALLS, TIME_OUTS = "Episode/falls", "Episode/time_outs"
 """Tags of the log, under which episodes that end are counted."""
 
@@ -177,6 +181,9 @@ class SkillEnv(VecEnv):
 
     mass: float
     """Mass of the robot before randomization, kg."""
+
+    constraints: tuple[str, ...] = ()
+    """Names of what is measured for the parts of a learner, see EXTRA_CONSTRAINTS."""
 
     terrains: tuple[str, ...] = ()
     """Names of the terrain types; none where all ground is flat."""

@@ -137,6 +137,7 @@ class EnvConfig:
     commands: CommandConfig
     skills: SkillConfig
     terminations: TerminationConfig
+    constraints: dict[str, Any]
     randomized_share: list[list[float]]
     randomization: RandomizationConfig
     terrain: TerrainConfig | None
