@@ -32,6 +32,7 @@ def find_term(
     where: str,
     own: tuple[str, ...] = (),
     hint: str = "its parameters, as in %s: {}",
+    kind: str = "parameter",
 ) -> partial[Any]:
     """Return the function of an entry, bound to the parameters that the entry has.
 
@@ -43,6 +44,7 @@ def find_term(
         where: Key of the YAML under which the entry stands, for messages.
         own: Keys that every entry takes; they are no parameters.
         hint: What an entry holds at least, for messages; %s is its name.
+        kind: What messages call its keys.
 
     Raises:
         ConfigError: No such function, or a parameter that is unknown, missing or no number.
@@ -53,7 +55,7 @@ def find_term(
         function = import_function(entry[FUNCTION], f"{where}.{name}.{FUNCTION}")
     else:
         function = find_function(module, name, first, where)
-    return _bind(function, entry, f"{where}.{name}", own)
+    return _bind(function, entry, f"{where}.{name}", own, kind)
 
 
 def find_terms(
@@ -116,14 +118,16 @@ def _is_term(function: Callable, first: type) -> bool:
     return is_public and bool(parameters) and parameters[0].annotation in (first, first.__name__)
 
 
-def _bind(function: Callable, entry: dict, where: str, own: tuple[str, ...]) -> partial[Any]:
+def _bind(
+    function: Callable, entry: dict, where: str, own: tuple[str, ...], kind: str
+) -> partial[Any]:
     """Return a function with the parameters of its entry."""
     signature = inspect.signature(function)
     parameters = {k: value for k, value in entry.items() if k not in (*own, FUNCTION)}
     allowed = list(signature.parameters)[1:]
     if unknown := [key for key in parameters if key not in allowed]:
         takes = ", ".join([*own, *allowed]) or "none"
-        raise ConfigError(f"{where}: unknown parameter '{unknown[0]}'; it takes {takes}")
+        raise ConfigError(f"{where}: unknown {kind} '{unknown[0]}'; it takes {takes}")
     try:
         signature.bind(None, **parameters)
     except TypeError as error:

@@ -127,6 +127,7 @@ class QuadrupedEnv(SkillEnv):
         phi = self._observer.imitation
         self.keyframe_features = phi(self._postures.at_rest([0.0]))
         self.feature_noise = phi.noise
+        self.imitation_units = tuple(phi.units)
         self.imitation_terms = tuple(zip(phi.names, phi.sizes, phi.scales, strict=True))
         self._rewards = RewardSum(cfg.rewards, self.step_dt, self.device)
         feet = len(self.robot_cfg.foot_geoms)

@@ -155,6 +155,9 @@ class SkillEnv(VecEnv):
     imitation_terms: tuple[tuple[str, int, float], ...]
     """Name, size and scale of each term of Phi, in their order."""
 
+    imitation_units: tuple[str, ...] = ()
+    """Unit of each of them before its scale; empty for none."""
+
     feature_noise: torch.Tensor
     """Standard deviation of one unit of discriminator input noise in each feature, (D,)."""
 

@@ -127,6 +127,15 @@ def test_a_termination_is_a_function_of_ones_own_and_a_line():
     assert fell > 0
 
 
+def test_a_constraint_is_a_function_of_ones_own_and_a_line():
+    env, _ = make_env("solo8_high")
+    assert env.constraints == ("low",)
+    for _ in range(10):
+        extras = env.step(6 * torch.randn(4, 8))[3]
+    below = (0.12 - env.measure().base_height).clamp(min=0.0)
+    torch.testing.assert_close(extras["constraints"], below[:, None])
+
+
 def test_an_observation_reaches_the_robot(tmp_path):
     from kiras_rl.checkpoint import load_policy
     from kiras_rl.deploy.policy import OnboardPolicy
