@@ -26,8 +26,8 @@ from kiras_rl.envs.model import build_scene
 from kiras_rl.envs.observations import View
 from kiras_rl.envs.observer import NOISE, Observer
 from kiras_rl.envs.postures import Postures
-from kiras_rl.envs.randomization import Randomizer
-from kiras_rl.envs.randomness import UniformBuffer
+from kiras_rl.envs.randomization import Randomizer, fields_of, find_randomizations
+from kiras_rl.envs.randomness import UniformBuffer, columns_of
 from kiras_rl.envs.rewards import RewardSum
 from kiras_rl.envs.sensing import Sensors
 from kiras_rl.envs.simulation.build import make_simulation
@@ -83,7 +83,9 @@ class QuadrupedEnv(SkillEnv):
             observation_delay=late[1] if late else 0,
             library=self._library,
         )
-        self.sim = make_simulation(self.scene, sim_cfg, num_envs, backend, device)
+        self._randomizations = find_randomizations(cfg.randomization)
+        written = fields_of(self._randomizations.values(), self.scene.model)
+        self.sim = make_simulation(self.scene, sim_cfg, num_envs, backend, device, written)
         self.keyframes = Keyframes.of(robot, device)
         self.keyframe_height, self.keyframe_pitch = self.keyframes.height, self.keyframes.pitch
         self.keyframe_joint_pos = self.keyframes.joint_pos
@@ -144,8 +146,12 @@ class QuadrupedEnv(SkillEnv):
         columns |= Sensors.columns(self.num_actions)
         if self._library:
             columns |= curriculum.COLUMNS | {"yaw": 1}
+        own = self._randomizations
+        columns |= columns_of(randomization.TERMS, own, self.num_actions)
         self._random = UniformBuffer(self.num_envs, columns, generator)
-        self._randomizer = Randomizer(cfg.randomization, self.scene, self.sim, self._random)
+        self._randomizer = Randomizer(
+            cfg.randomization, self.scene, self.sim, self._random, own, self.step_dt
+        )
         self._sensors = Sensors(cfg.randomization, self.sim, self.scene.sensors, self._random)
         self._curriculum = None
         if self._library:
@@ -314,6 +320,7 @@ class QuadrupedEnv(SkillEnv):
         push, velocity = self._randomizer.pushes(self.step_dt)
         qvel = self.sim.qvel.clone()
         qvel[:, :2].add_(velocity)
+        push, qvel = self._randomizer.kick(push, qvel)
         self.sim.write_velocity(push & ~done, qvel)
         self._read_begin()
 
@@ -325,8 +332,7 @@ class QuadrupedEnv(SkillEnv):
 
     def _reset_worlds(self, mask: torch.Tensor, start: torch.Tensor) -> None:
         """Put the masked worlds into the keyframes `start`, (N,), with new physics and ground."""
-        self._randomizer.reset(mask)
-        self._sensors.reset(mask, self._randomizer.randomized)
+        self._sensors.reset(mask, self._randomizer.reset(mask))
         if self._curriculum and self._ground:
             self._curriculum.begin(mask, self.task.skill)
             tile = self._curriculum.tiles() if self._placed is None else self._placed

@@ -77,7 +77,10 @@ class TerminationConfig:
 
 @dataclass
 class RandomizationConfig:
-    """Domain randomization: ranges [low, high]; null leaves the nominal value."""
+    """Domain randomization: ranges [low, high]; null leaves the nominal value.
+
+    `terms` holds others: name -> {parameters of the term}; null removes one, or all.
+    """
 
     friction: tuple[float, float] | None
     payload: tuple[float, float] | None
@@ -96,6 +99,7 @@ class RandomizationConfig:
     observation_delay: tuple[int, int] | None
     push_velocity: tuple[float, float] | None
     push_interval: float
+    terms: dict[str, Any] | None
 
 
 @dataclass

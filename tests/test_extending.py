@@ -161,6 +161,15 @@ def test_an_observation_reaches_the_robot(tmp_path):
     assert policy.frame[-1] == pytest.approx(seen, abs=1e-5)
 
 
+def test_a_randomization_is_a_function_of_ones_own_and_a_line():
+    env, _ = make_env("solo8_soft_ground")
+    constant = env.sim.state_dict()["field/geom_solref"][..., 0]
+    assert len(constant.unique()) == 4  # one a world
+    assert 0.02 <= constant.min() < constant.max() < 0.06
+    plain, _ = make_env("solo8_quick")
+    assert "field/geom_solref" not in plain.sim.state_dict()
+
+
 def test_a_robot_is_a_folder():
     from kiras_rl.robots.robot import list_robots, load_robot
     from kiras_rl.robots.statics import check_keyframe
