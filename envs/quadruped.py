@@ -14,7 +14,7 @@ from tensordict import TensorDict
 from kiras_rl import interfaces as names
 from kiras_rl.envs import commands, curriculum, randomization
 from kiras_rl.envs.bounds import broken
-from kiras_rl.envs.commands import TaskSampler
+from kiras_rl.envs.commands import TaskSampler, find_commands
 from kiras_rl.envs.constraints import Constraints
 from kiras_rl.envs.curriculum import Curriculum
 from kiras_rl.envs.description import describe_deployment
@@ -31,7 +31,7 @@ from kiras_rl.envs.randomness import UniformBuffer, columns_of
 from kiras_rl.envs.rewards import RewardSum
 from kiras_rl.envs.sensing import Sensors
 from kiras_rl.envs.simulation.build import make_simulation
-from kiras_rl.envs.state import STANDING, Keyframes, Limits, RobotState, Step, Task
+from kiras_rl.envs.state import STANDING, Asked, Keyframes, Limits, RobotState, Step, Task
 from kiras_rl.envs.terminations import Terminations
 from kiras_rl.envs.terrain_library import build_library
 from kiras_rl.envs.terrains import CROSSED
@@ -109,7 +109,10 @@ class QuadrupedEnv(SkillEnv):
         n, device = self.num_envs, self.device
         self._all = torch.ones(n, dtype=torch.bool, device=device)
         index = torch.zeros(n, dtype=torch.int64, device=device)
-        self.task = Task.of(torch.zeros(n, 3, device=device), index, index)
+        self._commands = find_commands(self.cfg.commands.terms)
+        widths = {name: term.func.width for name, term in self._commands.items()}
+        command = torch.zeros(n, 3, device=device)
+        self.task = Task.of(command, index, index, Asked.nothing(widths, command))
         self._held = False  # tasks set from outside stay until set again
         self._length = index.clone()
         self._action = torch.zeros(n, self.num_actions, device=device)
@@ -120,7 +123,7 @@ class QuadrupedEnv(SkillEnv):
         self._kinematics = FootKinematics(self.scene.model, robot, device)
         self.robot = RobotState(self.sim, self.scene.sensors, self._kinematics, self._ground)
         self._postures = Postures(
-            robot, self.keyframes, self._kinematics, self._ground, self.cfg.skills
+            robot, self.keyframes, self._kinematics, self._ground, self.cfg.skills, widths
         )
 
     def _build_terms(self, seed: int) -> None:
@@ -148,6 +151,7 @@ class QuadrupedEnv(SkillEnv):
             columns |= curriculum.COLUMNS | {"yaw": 1}
         own = self._randomizations
         columns |= columns_of(randomization.TERMS, own, self.num_actions)
+        columns |= columns_of(commands.TERMS, self._commands, self.num_actions)
         self._random = UniformBuffer(self.num_envs, columns, generator)
         self._randomizer = Randomizer(
             cfg.randomization, self.scene, self.sim, self._random, own, self.step_dt
@@ -164,6 +168,8 @@ class QuadrupedEnv(SkillEnv):
             self._random,
             is_rough=~self._is_flat,
             on_rough=cfg.terrain.task if cfg.terrain else None,
+            terms=self._commands,
+            step_dt=self.step_dt,
         )
         self._placed: torch.Tensor | None = None  # tiles chosen from outside, (N,)
         self._advance = Recorded(
@@ -177,7 +183,8 @@ class QuadrupedEnv(SkillEnv):
 
     def _carried(self) -> list[tuple[object, str]]:
         """Return the attributes that a step reads and replaces; see `Recorded`."""
-        names = [*_BUFFERS, "_last_action", *(f"task.{name}" for name in vars(self.task))]
+        names = [*_BUFFERS, "_last_action", *(f"task.{name}" for name in self.task.tensors())]
+        names += [f"task.terms.{name}" for name in vars(self.task.terms)]
         slots: list[tuple[object, str]] = [(self, name) for name in names]
         slots += [(self._memory, name) for name in self._memory.names]
         slots += [(self._sensors, "errors")]
@@ -310,7 +317,9 @@ class QuadrupedEnv(SkillEnv):
 
     def _begin_next(self, done: torch.Tensor) -> None:
         """Choose the next tasks, reset the worlds that ended and push some of the others."""
-        if not self._held:
+        if self._held:
+            self.task = self._tasks.go_on(self.task, done)
+        else:
             task = self._tasks.advance(self.task, done)
             if self._curriculum:
                 self._curriculum.keep_counting((task.skill == self.task.skill) | done)
@@ -408,6 +417,7 @@ class QuadrupedEnv(SkillEnv):
             skill=skill.clone(),
             start=start.clone(),
             heading=heading if given else task.heading,
+            terms=task.terms,
         )
         self._reset_worlds(self._all, self.task.start)
         self._read_begin()
@@ -431,7 +441,7 @@ class QuadrupedEnv(SkillEnv):
         """Give every world a new skill and command, which stay until the next call."""
         self._held = True
         start = torch.where(skill == self.task.skill, self.task.start, self.task.skill)
-        self.task = Task.of(command, skill, start)
+        self.task = Task.of(command, skill, start, self.task.terms)
         return copied(self._observer.change_task(self._view()))
 
     def set_skill_probabilities(self, probabilities: torch.Tensor) -> None:
@@ -488,7 +498,8 @@ class QuadrupedEnv(SkillEnv):
     def state_dict(self) -> dict:
         """Return all that the next steps depend on, for an exact resume."""
         state = {
-            "task": vars(self.task),
+            "task": self.task.tensors(),
+            "commands": dict(vars(self.task.terms)),
             "held": self._held,
             "probabilities": self._tasks.probabilities,
             "generator": self._random.generator.get_state(),
@@ -504,7 +515,9 @@ class QuadrupedEnv(SkillEnv):
     def load_state_dict(self, state: dict) -> None:
         """Go on from a saved state of the same number of worlds."""
         self.sim.load_state_dict(state["sim"])
-        self.task = Task(**{k: v.to(self.device) for k, v in state["task"].items()})
+        task = {k: v.to(self.device) for k, v in state["task"].items()}
+        terms = {k: v.to(self.device) for k, v in state.get("commands", {}).items()}
+        self.task = Task(**task, terms=Asked(**terms))
         self._held = state["held"]
         self.set_skill_probabilities(state["probabilities"])
         self._random.generator.set_state(state["generator"].cpu())

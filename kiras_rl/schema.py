@@ -46,7 +46,10 @@ class RewardConfig:
 
 @dataclass
 class CommandConfig:
-    """Velocity commands in the heading frame."""
+    """Velocity commands in the heading frame, and others.
+
+    `terms` holds the others: name -> {parameters of the term}; null removes one.
+    """
 
     lin_vel_x: tuple[float, float]
     lin_vel_y: tuple[float, float]
@@ -54,6 +57,7 @@ class CommandConfig:
     zero_probability: float
     resample_probability: float
     heading_gain: float
+    terms: dict[str, Any]
 
 
 @dataclass

@@ -170,6 +170,17 @@ def test_a_randomization_is_a_function_of_ones_own_and_a_line():
     assert "field/geom_solref" not in plain.sim.state_dict()
 
 
+def test_a_command_is_a_function_of_ones_own_and_its_lines():
+    env, _ = make_env("solo8_heights")
+    for _ in range(5):
+        asked = env.task.terms["height"]
+        obs, _, _, extras = env.step(torch.randn(4, 8))
+        error = env.measure().base_height - asked[:, 0]
+        paid = 0.5 * torch.exp(-((error / 0.02) ** 2)).mean()
+        torch.testing.assert_close(extras["log"]["Reward/height"], paid)
+        torch.testing.assert_close(obs["critic"][:, -1:], 10.0 * env.task.terms["height"])
+
+
 def test_a_robot_is_a_folder():
     from kiras_rl.robots.robot import list_robots, load_robot
     from kiras_rl.robots.statics import check_keyframe
