@@ -1,14 +1,25 @@
-"""What the robots are asked to do: velocity commands and skills."""
+"""What the robots are asked to do: velocity commands, skills, and other commands.
+
+Another command is a function of `Asking` in `env.commands.terms`. It says by `commanding` how many
+numbers it asks for and how many random ones it takes, and returns in every step what it asks for.
+Rewards and observations find that in `task.terms["name"]`.
+"""
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
 
 import torch
 
+from kiras_rl.config import ConfigError
 from kiras_rl.envs import rotations
-from kiras_rl.envs.randomness import UniformBuffer, scale_to
-from kiras_rl.envs.state import Task
+from kiras_rl.envs.lookup import find_terms
+from kiras_rl.envs.randomness import Drawing, UniformBuffer, scale_to
+from kiras_rl.envs.shapes import evaluate
+from kiras_rl.envs.state import Asked, Task
 from kiras_rl.schema import CommandConfig, RoughTaskConfig, SkillConfig
 
 COLUMNS = {
@@ -20,7 +31,62 @@ COLUMNS = {
     "start": 2,
     "heading": 1,
 }
-"""Random numbers that this module takes each step."""
+"""Random numbers that this module takes each step, beside those of terms."""
+
+TERMS = "command"  # group of the random numbers that terms take
+_WHERE = "env.commands.terms"
+
+
+@dataclass
+class Asking(Drawing):
+    """What a command may look at.
+
+    Attributes:
+        before: What it asked for in the step before, (N, width); zero in the very first.
+        renewed: Worlds whose commands are drawn anew, (N,) bool: at a reset, and now and then.
+        task: The velocities and skills of the next step.
+        dt: Duration of a control step, s.
+    """
+
+    before: torch.Tensor
+    renewed: torch.Tensor
+    task: Task
+    dt: float
+
+
+def commanding(width: int, numbers: int = 0) -> Callable[[Callable], Callable]:
+    """Mark a command of `width` numbers a world that takes so many random ones."""
+
+    def mark(term: Callable) -> Callable:
+        term.width, term.numbers = width, numbers
+        return term
+
+    return mark
+
+
+@commanding(width=2, numbers=2)
+def clock(asking: Asking, frequency: tuple[float, float]) -> torch.Tensor:
+    """Ask for a rhythm: how far its turn is, in [0, 1), and its frequency, (N, 2), 1 and Hz."""
+    phase, rate = asking.before.split(1, dim=1)
+    later = torch.cat([(phase + asking.dt * rate) % 1.0, rate], dim=1)
+    drawn = torch.cat([asking.uniform[:, :1], asking.between(frequency)[:, 1:]], dim=1)
+    return torch.where(asking.renewed[:, None], drawn, later)
+
+
+def find_commands(terms: Mapping[str, Any]) -> dict[str, partial[Any]]:
+    """Return the commands of a configuration by name.
+
+    Raises:
+        ConfigError: Unknown command or parameter, or a function that is not marked by `commanding`.
+    """
+    found = find_terms(globals(), terms, Asking, _WHERE)
+    for name, term in found.items():
+        if not hasattr(term.func, "width"):
+            raise ConfigError(
+                f"{_WHERE}.{name}: '{term.func.__name__}' does not say how many numbers it asks "
+                "for: mark it, as in @commanding(width=2, numbers=1)"
+            )
+    return found
 
 
 class TaskSampler:
@@ -34,6 +100,8 @@ class TaskSampler:
         random: UniformBuffer,
         is_rough: torch.Tensor,
         on_rough: RoughTaskConfig | None = None,
+        terms: Mapping[str, partial[Any]] | None = None,
+        step_dt: float = 0.0,
     ) -> None:
         """Begin with uniform skill probabilities.
 
@@ -44,7 +112,10 @@ class TaskSampler:
             random: Numbers of each step.
             is_rough: Worlds whose ground is rough, (N,) bool.
             on_rough: What is different there; None for nothing.
+            terms: Other commands, of `find_commands`.
+            step_dt: Duration of a control step, s.
         """
+        self._terms, self._step_dt = terms or {}, step_dt
         device = is_rough.device
         self._num_skills = num_skills
         self._random = random
@@ -84,7 +155,28 @@ class TaskSampler:
         skill = torch.where(reset | switch, self.draw_skill(), task.skill)
         before = torch.where(switch, task.skill, task.start)
         start = torch.where(reset, self.draw_start(skill), before)
-        return Task(command=command, skill=skill, start=start, heading=heading)
+        asked = Task(command, skill, start, heading, task.terms)
+        return self.go_on(asked, renewed)
+
+    def go_on(self, task: Task, renewed: torch.Tensor) -> Task:
+        """Return the tasks with what other commands ask for in the next step.
+
+        Args:
+            task: Tasks whose other commands are those of this step.
+            renewed: Worlds whose commands are drawn anew, (N,) bool.
+        """
+        if not self._terms:
+            return task
+        asked = {name: self._ask(name, term, task, renewed) for name, term in self._terms.items()}
+        return replace(task, terms=Asked(**asked))
+
+    def _ask(
+        self, name: str, term: partial[Any], task: Task, renewed: torch.Tensor
+    ) -> torch.Tensor:
+        uniform, before = self._random[f"{TERMS}/{name}"], task.terms[name]
+        where = f"{_WHERE}.{name}"
+        asking = Asking(uniform, where, before, renewed, task, self._step_dt)
+        return evaluate(term, asking, where, tuple(before.shape))
 
     def steer(self, task: Task, yaw: torch.Tensor) -> Task:
         """Return the tasks with the yaw rates that hold their headings.

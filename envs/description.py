@@ -18,7 +18,11 @@ def describe_deployment(
         proprio: The observation group that the robot has to rebuild.
         step_dt: Duration of a control step, s.
     """
-    terms = zip(proprio.names, proprio.sizes, proprio.scales, strict=True)
+    rows = zip(proprio.names, proprio.sizes, proprio.scales, proprio.onboard, strict=True)
+    terms = [
+        {"name": name, "size": size, "scale": scale} | ({"onboard": twin} if twin else {})
+        for name, size, scale, twin in rows
+    ]
     arrays = ("default_joint_pos", "kp", "kd", "torque_limit", "action_scale")
     commands = ("lin_vel_x", "lin_vel_y", "ang_vel_z")
     return {
@@ -28,7 +32,7 @@ def describe_deployment(
         "joint_limits": robot.joint_limits.tolist(),
         "velocity_limit": robot.velocity_limit.tolist(),
         "action_clip": config.action_clip,
-        "observation": [{"name": n, "size": k, "scale": x} for n, k, x in terms],
+        "observation": terms,
         "history_length": config.observations.history_length,
         "skills": list(robot.skills),
         "keyframes": {

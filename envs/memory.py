@@ -20,6 +20,8 @@ from typing import TYPE_CHECKING
 
 import torch
 
+from kiras_rl.config import ConfigError
+
 if TYPE_CHECKING:
     from kiras_rl.envs.state import Step
 
@@ -43,9 +45,16 @@ class Memory:
     def __init__(
         self, terms: Iterable[Callable], num_worlds: int, feet: int, device: torch.device
     ) -> None:
-        """Begin with zeros; a memory that several terms read is kept once."""
-        wanted = [update for term in terms for update in getattr(term, "memories", ())]
-        self._updates = {update.__name__: update for update in wanted}
+        """Begin with zeros; a memory that several terms read is kept once.
+
+        Raises:
+            ConfigError: Two memories of one name.
+        """
+        self._updates: dict[str, Update] = {}
+        for update in (update for term in terms for update in getattr(term, "memories", ())):
+            name = update.__name__
+            if self._updates.setdefault(name, update) is not update:
+                raise ConfigError(f"two terms remember different things as '{name}': rename one")
         for name in self._updates:
             setattr(self, name, torch.zeros(num_worlds, feet, device=device))
 

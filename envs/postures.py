@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 
 import torch
 
@@ -11,7 +12,7 @@ from kiras_rl.envs.ground import Ground
 from kiras_rl.envs.kinematics import FootKinematics
 from kiras_rl.envs.observations import View
 from kiras_rl.envs.randomness import UniformBuffer, scale_to
-from kiras_rl.envs.state import Keyframes, Limits, RobotState, Task
+from kiras_rl.envs.state import Asked, Keyframes, Limits, RobotState, Task
 from kiras_rl.robots.robot import Robot
 from kiras_rl.schema import SkillConfig
 
@@ -28,8 +29,9 @@ class Postures:
         kinematics: FootKinematics,
         ground: Ground | None,
         config: SkillConfig,
+        widths: Mapping[str, int] | None = None,
     ) -> None:
-        """Collect the constants of the robot."""
+        """Collect the constants of the robot; `widths` are those of the terms of commands."""
         device = keyframes.height.device
 
         def tensor(values: object) -> torch.Tensor:
@@ -39,7 +41,7 @@ class Postures:
         self._action_scale = tensor(robot.action_scale)
         self._limits = Limits.of(robot, device)
         self._keyframes, self._kinematics, self._ground = keyframes, kinematics, ground
-        self._config = config
+        self._config, self._widths = config, widths or {}
         self._geoms = len(robot.foot_geoms), len(robot.base_geoms), len(robot.penalised_geoms)
 
     def asked(self, action: torch.Tensor) -> torch.Tensor:
@@ -86,7 +88,7 @@ class Postures:
             speeds: G commands v_x, m/s.
 
         Returns:
-            S * G robots, the commands of the first skill first.
+            S * G robots, the commands of the first skill first; other commands ask for nothing, 0.
         """
         device = self._keyframes.height.device
         count = len(self._keyframes.height)
@@ -94,6 +96,6 @@ class Postures:
         command = torch.zeros(len(skill), 3, device=device)
         command[:, 0] = torch.tensor(speeds, device=device).repeat(count)
         robot = RobotState.at_rest(self._keyframes, skill, self._geoms)
-        task = Task.of(command, skill, skill)
+        task = Task.of(command, skill, skill, Asked.nothing(self._widths, command))
         action = self.holding(robot.joint_pos)
         return View(robot, robot, task, self._keyframes, self.default_joint_pos, action)

@@ -5,14 +5,17 @@ from __future__ import annotations
 import math
 import time
 from dataclasses import replace
+from functools import reduce
+from operator import or_
 
 import torch
 from tensordict import TensorDict
 
 from kiras_rl import interfaces as names
-from kiras_rl.envs import commands, curriculum, randomization, terminations
+from kiras_rl.envs import commands, curriculum, randomization
 from kiras_rl.envs.bounds import broken
-from kiras_rl.envs.commands import TaskSampler
+from kiras_rl.envs.commands import TaskSampler, find_commands
+from kiras_rl.envs.constraints import Constraints
 from kiras_rl.envs.curriculum import Curriculum
 from kiras_rl.envs.description import describe_deployment
 from kiras_rl.envs.ground import Ground
@@ -23,12 +26,13 @@ from kiras_rl.envs.model import build_scene
 from kiras_rl.envs.observations import View
 from kiras_rl.envs.observer import NOISE, Observer
 from kiras_rl.envs.postures import Postures
-from kiras_rl.envs.randomization import Randomizer
-from kiras_rl.envs.randomness import UniformBuffer
+from kiras_rl.envs.randomization import Randomizer, fields_of, find_randomizations
+from kiras_rl.envs.randomness import UniformBuffer, columns_of
 from kiras_rl.envs.rewards import RewardSum
 from kiras_rl.envs.sensing import Sensors
 from kiras_rl.envs.simulation.build import make_simulation
-from kiras_rl.envs.state import STANDING, Keyframes, Limits, RobotState, Step, Task
+from kiras_rl.envs.state import STANDING, Asked, Keyframes, Limits, RobotState, Step, Task
+from kiras_rl.envs.terminations import Terminations
 from kiras_rl.envs.terrain_library import build_library
 from kiras_rl.envs.terrains import CROSSED
 from kiras_rl.interfaces import Measurements, SkillEnv
@@ -79,7 +83,9 @@ class QuadrupedEnv(SkillEnv):
             observation_delay=late[1] if late else 0,
             library=self._library,
         )
-        self.sim = make_simulation(self.scene, sim_cfg, num_envs, backend, device)
+        self._randomizations = find_randomizations(cfg.randomization)
+        written = fields_of(self._randomizations.values(), self.scene.model)
+        self.sim = make_simulation(self.scene, sim_cfg, num_envs, backend, device, written)
         self.keyframes = Keyframes.of(robot, device)
         self.keyframe_height, self.keyframe_pitch = self.keyframes.height, self.keyframes.pitch
         self.keyframe_joint_pos = self.keyframes.joint_pos
@@ -103,7 +109,10 @@ class QuadrupedEnv(SkillEnv):
         n, device = self.num_envs, self.device
         self._all = torch.ones(n, dtype=torch.bool, device=device)
         index = torch.zeros(n, dtype=torch.int64, device=device)
-        self.task = Task.of(torch.zeros(n, 3, device=device), index, index)
+        self._commands = find_commands(self.cfg.commands.terms)
+        widths = {name: term.func.width for name, term in self._commands.items()}
+        command = torch.zeros(n, 3, device=device)
+        self.task = Task.of(command, index, index, Asked.nothing(widths, command))
         self._held = False  # tasks set from outside stay until set again
         self._length = index.clone()
         self._action = torch.zeros(n, self.num_actions, device=device)
@@ -114,7 +123,7 @@ class QuadrupedEnv(SkillEnv):
         self._kinematics = FootKinematics(self.scene.model, robot, device)
         self.robot = RobotState(self.sim, self.scene.sensors, self._kinematics, self._ground)
         self._postures = Postures(
-            robot, self.keyframes, self._kinematics, self._ground, self.cfg.skills
+            robot, self.keyframes, self._kinematics, self._ground, self.cfg.skills, widths
         )
 
     def _build_terms(self, seed: int) -> None:
@@ -123,10 +132,16 @@ class QuadrupedEnv(SkillEnv):
         phi = self._observer.imitation
         self.keyframe_features = phi(self._postures.at_rest([0.0]))
         self.feature_noise = phi.noise
+        self.imitation_units = tuple(phi.units)
         self.imitation_terms = tuple(zip(phi.names, phi.sizes, phi.scales, strict=True))
         self._rewards = RewardSum(cfg.rewards, self.step_dt, self.device)
         feet = len(self.robot_cfg.foot_geoms)
-        self._memory = Memory(self._rewards.functions, self.num_envs, feet, self.device)
+        self._terminations = Terminations(cfg.terminations.terms)
+        terms = [*self._rewards.functions, *self._terminations.functions]
+        self._constraints = Constraints(cfg.constraints)
+        self.constraints = self._constraints.names
+        terms += self._constraints.functions
+        self._memory = Memory(terms, self.num_envs, feet, self.device)
         generator = torch.Generator(device=self.device)
         generator.manual_seed(seed)
         columns = {"joint": self.num_actions, "velocity": 2, NOISE: self._observer.proprio.size}
@@ -134,8 +149,13 @@ class QuadrupedEnv(SkillEnv):
         columns |= Sensors.columns(self.num_actions)
         if self._library:
             columns |= curriculum.COLUMNS | {"yaw": 1}
+        own = self._randomizations
+        columns |= columns_of(randomization.TERMS, own, self.num_actions)
+        columns |= columns_of(commands.TERMS, self._commands, self.num_actions)
         self._random = UniformBuffer(self.num_envs, columns, generator)
-        self._randomizer = Randomizer(cfg.randomization, self.scene, self.sim, self._random)
+        self._randomizer = Randomizer(
+            cfg.randomization, self.scene, self.sim, self._random, own, self.step_dt
+        )
         self._sensors = Sensors(cfg.randomization, self.sim, self.scene.sensors, self._random)
         self._curriculum = None
         if self._library:
@@ -148,6 +168,8 @@ class QuadrupedEnv(SkillEnv):
             self._random,
             is_rough=~self._is_flat,
             on_rough=cfg.terrain.task if cfg.terrain else None,
+            terms=self._commands,
+            step_dt=self.step_dt,
         )
         self._placed: torch.Tensor | None = None  # tiles chosen from outside, (N,)
         self._advance = Recorded(
@@ -161,7 +183,8 @@ class QuadrupedEnv(SkillEnv):
 
     def _carried(self) -> list[tuple[object, str]]:
         """Return the attributes that a step reads and replaces; see `Recorded`."""
-        names = [*_BUFFERS, "_last_action", *(f"task.{name}" for name in vars(self.task))]
+        names = [*_BUFFERS, "_last_action", *(f"task.{name}" for name in self.task.tensors())]
+        names += [f"task.terms.{name}" for name in vars(self.task.terms)]
         slots: list[tuple[object, str]] = [(self, name) for name in names]
         slots += [(self._memory, name) for name in self._memory.names]
         slots += [(self._sensors, "errors")]
@@ -174,7 +197,10 @@ class QuadrupedEnv(SkillEnv):
         return slots
 
     def _begin(self) -> None:
-        self._judge(~self._all, ~self._all)  # a reward of a wrong shape is refused now
+        step = self._last_step(~self._all)
+        self._terminations(step)  # a term of a wrong shape is refused now
+        self._violations(step, ~self._all)
+        self._reward(step, ~self._all)
         self.reset()
         if self.cfg.terminations.random_first_length:
             # Otherwise all worlds time out together, and the data of a rollout is all alike.
@@ -219,15 +245,16 @@ class QuadrupedEnv(SkillEnv):
         self.robot.read_step()
         diverged = self.sim.diverged | broken(self.robot, self.keyframes, GRAVITY * self.mass)
         invalid = diverged | self.sim.overflowed
-        fallen = diverged | terminations.fallen(
-            self.robot, self.task, self.keyframes, self.cfg.terminations
-        )
+        step = self._last_step(diverged)
+        reasons = self._terminations(step)
+        step.fallen = fallen = reduce(or_, reasons, diverged)
+        violations = self._violations(step, invalid)
         distance = self._distance()
         crossed = (distance > CROSSED) & (self._ground is not None)  # flat ground has no end
         # Memory that ran out is no fault of the policy's: the episode is cut.
         cut = self.sim.overflowed | crossed | (self._length >= self.max_episode_length)
         time_outs = cut & ~fallen
-        terms = self._judge(fallen, invalid)
+        terms = self._reward(step, invalid)
         observer, view = self._observer, self._view()
         extras = {
             names.EXTRA_TIME_OUTS: time_outs,
@@ -235,7 +262,8 @@ class QuadrupedEnv(SkillEnv):
             names.EXTRA_VALID: ~invalid,
             names.EXTRA_FLAT: self._is_flat,
             names.NEXT_PROPRIO: _unless(invalid, observer.proprio(view), observer.clean),
-            "log": self._log(terms, fallen, time_outs, diverged),
+            "log": self._log(terms, [fallen, time_outs, diverged, *reasons]),
+            **violations,
         }
         self._measurements = measure(self.robot, self._limits, distance, fallen | invalid)
 
@@ -251,13 +279,10 @@ class QuadrupedEnv(SkillEnv):
         """Return how far bases are from the middle of their tile, max(|x|, |y|), (N,), m."""
         return self.robot.base_pos_w[:, :2].abs().amax(dim=1)
 
-    def _judge(self, fallen: torch.Tensor, invalid: torch.Tensor) -> torch.Tensor:
-        """Return the weighted reward terms, (N, terms).
-
-        A world whose physics broke has no meaningful terms; it earns nothing but the termination.
-        """
+    def _last_step(self, fallen: torch.Tensor) -> Step:
+        """Return the step that was just made, as terms see it."""
         command = self.task.command
-        step = Step(
+        return Step(
             stands=torch.linalg.vector_norm(command, dim=-1) < STANDING,
             robot=self.robot,
             task=self.task,
@@ -274,13 +299,27 @@ class QuadrupedEnv(SkillEnv):
             weight=GRAVITY * self.mass,
             dt=self.step_dt,
         )
+
+    def _violations(self, step: Step, invalid: torch.Tensor) -> dict[str, torch.Tensor]:
+        """Return what a step adds to its extras where constraints are configured."""
+        if not self.constraints:
+            return {}
+        return {names.EXTRA_CONSTRAINTS: self._constraints(step).masked_fill(invalid[:, None], 0.0)}
+
+    def _reward(self, step: Step, invalid: torch.Tensor) -> torch.Tensor:
+        """Return the weighted reward terms, (N, terms), and remember the step.
+
+        A world whose physics broke has no meaningful terms; it earns nothing but the termination.
+        """
         terms = self._rewards(step)
         self._memory.advance(step)
         return terms.masked_fill(invalid[:, None] & ~self._rewards.is_termination, 0.0)
 
     def _begin_next(self, done: torch.Tensor) -> None:
         """Choose the next tasks, reset the worlds that ended and push some of the others."""
-        if not self._held:
+        if self._held:
+            self.task = self._tasks.go_on(self.task, done)
+        else:
             task = self._tasks.advance(self.task, done)
             if self._curriculum:
                 self._curriculum.keep_counting((task.skill == self.task.skill) | done)
@@ -290,6 +329,7 @@ class QuadrupedEnv(SkillEnv):
         push, velocity = self._randomizer.pushes(self.step_dt)
         qvel = self.sim.qvel.clone()
         qvel[:, :2].add_(velocity)
+        push, qvel = self._randomizer.kick(push, qvel)
         self.sim.write_velocity(push & ~done, qvel)
         self._read_begin()
 
@@ -301,8 +341,7 @@ class QuadrupedEnv(SkillEnv):
 
     def _reset_worlds(self, mask: torch.Tensor, start: torch.Tensor) -> None:
         """Put the masked worlds into the keyframes `start`, (N,), with new physics and ground."""
-        self._randomizer.reset(mask)
-        self._sensors.reset(mask, self._randomizer.randomized)
+        self._sensors.reset(mask, self._randomizer.reset(mask))
         if self._curriculum and self._ground:
             self._curriculum.begin(mask, self.task.skill)
             tile = self._curriculum.tiles() if self._placed is None else self._placed
@@ -327,20 +366,16 @@ class QuadrupedEnv(SkillEnv):
     def _observe(self, begun: torch.Tensor) -> TensorDict:
         return self._observer.observe(self._view(), self._sensors, begun, self._random)
 
-    def _log(
-        self,
-        terms: torch.Tensor,
-        fallen: torch.Tensor,
-        time_outs: torch.Tensor,
-        diverged: torch.Tensor,
-    ) -> dict[str, torch.Tensor]:
+    def _log(self, terms: torch.Tensor, events: list[torch.Tensor]) -> dict[str, torch.Tensor]:
+        """Return means of the weighted terms (N, terms) and counts of events, (N,) bool each."""
         means = terms.mean(dim=0).unbind()
         log = {
             f"Reward/{name}": mean for name, mean in zip(self._rewards.names, means, strict=True)
         }
-        events = torch.stack([fallen, time_outs, diverged, self.sim.overflowed], dim=1)
-        counts = events.sum(dim=0, dtype=torch.float32).unbind()
-        log |= zip(_EVENTS, counts, strict=True)
+        reasons = [f"{names.ENDED_BY}{name}" for name in self._terminations.names]
+        happened = torch.stack([self.sim.overflowed, *events], dim=1)
+        counts = happened.sum(dim=0, dtype=torch.float32).unbind()
+        log |= zip([*_EVENTS, *reasons], counts, strict=True)
         return log | (self._curriculum.describe(self.skills) if self._curriculum else {})
 
     # --- the rest of SkillEnv -----------------------------------------------------------------
@@ -382,6 +417,7 @@ class QuadrupedEnv(SkillEnv):
             skill=skill.clone(),
             start=start.clone(),
             heading=heading if given else task.heading,
+            terms=task.terms,
         )
         self._reset_worlds(self._all, self.task.start)
         self._read_begin()
@@ -405,7 +441,7 @@ class QuadrupedEnv(SkillEnv):
         """Give every world a new skill and command, which stay until the next call."""
         self._held = True
         start = torch.where(skill == self.task.skill, self.task.start, self.task.skill)
-        self.task = Task.of(command, skill, start)
+        self.task = Task.of(command, skill, start, self.task.terms)
         return copied(self._observer.change_task(self._view()))
 
     def set_skill_probabilities(self, probabilities: torch.Tensor) -> None:
@@ -462,7 +498,8 @@ class QuadrupedEnv(SkillEnv):
     def state_dict(self) -> dict:
         """Return all that the next steps depend on, for an exact resume."""
         state = {
-            "task": vars(self.task),
+            "task": self.task.tensors(),
+            "commands": dict(vars(self.task.terms)),
             "held": self._held,
             "probabilities": self._tasks.probabilities,
             "generator": self._random.generator.get_state(),
@@ -478,7 +515,9 @@ class QuadrupedEnv(SkillEnv):
     def load_state_dict(self, state: dict) -> None:
         """Go on from a saved state of the same number of worlds."""
         self.sim.load_state_dict(state["sim"])
-        self.task = Task(**{k: v.to(self.device) for k, v in state["task"].items()})
+        task = {k: v.to(self.device) for k, v in state["task"].items()}
+        terms = {k: v.to(self.device) for k, v in state.get("commands", {}).items()}
+        self.task = Task(**task, terms=Asked(**terms))
         self._held = state["held"]
         self.set_skill_probabilities(state["probabilities"])
         self._random.generator.set_state(state["generator"].cpu())
@@ -493,7 +532,7 @@ class QuadrupedEnv(SkillEnv):
         self.robot.read_kinematics()
 
 
-_EVENTS = ("Episode/falls", "Episode/time_outs", "Sim/diverged", "Sim/overflowed")
+_EVENTS = ("Sim/overflowed", names.FALLS, names.TIME_OUTS, "Sim/diverged")
 _BUFFERS = ("_length", "_action", "_last_joint_vel", "_last_joint_torque")
 
 

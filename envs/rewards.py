@@ -12,13 +12,12 @@ stance (kiras_rl.envs.memory), and leave a robot alone that is told to stand.
 
 from __future__ import annotations
 
-import inspect
 from functools import partial
 
 import torch
 
 from kiras_rl.config import ConfigError
-from kiras_rl.envs.lookup import find_function
+from kiras_rl.envs.lookup import find_term
 from kiras_rl.envs.memory import remembering
 from kiras_rl.envs.shapes import evaluate
 from kiras_rl.envs.state import Step
@@ -284,11 +283,6 @@ class RewardSum:
             ConfigError: Unknown term or parameter, or a parameter that is no number.
         """
         terms = {name: values for name, values in config.terms.items() if values is not None}
-        for name, values in terms.items():
-            if not isinstance(values, dict):
-                raise ConfigError(
-                    f"env.rewards.terms.{name}: give a weight, as in {name}: {{weight: 1.0}}"
-                )
         self.names = list(terms)
         self.is_termination = torch.tensor([n == "termination" for n in terms], device=device)
         self._terms = [_bind(name, values) for name, values in terms.items()]
@@ -321,40 +315,17 @@ class RewardSum:
         return torch.stack(values, dim=1) * self._weights
 
 
-_OF_ALL = ("weight", "whole")  # keys that every term takes
-
-
 def _bind(name: str, values: dict) -> partial[torch.Tensor]:
-    function = find_function(globals(), name, Step, where="env.rewards.terms")
-    parameters = {key: value for key, value in values.items() if key not in _OF_ALL}
-    signature = inspect.signature(function)
-    allowed = list(signature.parameters)[1:]
-    unknown = [key for key in parameters if key not in allowed]
-    if unknown or "weight" not in values:
-        problem = f"unknown parameter '{unknown[0]}'" if unknown else "no weight"
-        raise ConfigError(
-            f"env.rewards.terms.{name}: {problem}; it takes {', '.join(['weight', *allowed])}"
-        )
+    where = "env.rewards.terms"
+    own, hint = ("weight", "whole"), "a weight, as in %s: {weight: 1.0}"
+    term = find_term(globals(), name, values, Step, where, own, hint)
+    if "weight" not in values:
+        raise ConfigError(f"{where}.{name}: no weight; it takes weight")
     if not isinstance(values.get("whole", False), bool):
-        raise ConfigError(
-            f"env.rewards.terms.{name}.whole={values['whole']!r}: must be true or false"
-        )
-    try:
-        signature.bind(None, **parameters)
-    except TypeError as error:
-        raise ConfigError(f"env.rewards.terms.{name}: {error}") from None
-    for key, value in parameters.items():
-        if signature.parameters[key].annotation in ("int", "float"):
-            _check_number(f"env.rewards.terms.{name}.{key}", value)
-    return partial(function, **parameters)
+        raise ConfigError(f"{where}.{name}.whole={values['whole']!r}: must be true or false")
+    return term
 
 
 def _schedule(weight: float | list[list[float]]) -> list[list[float]]:
     """Return the weight as [share of the phase, weight] points."""
     return weight if isinstance(weight, list) else [[0.0, weight]]
-
-
-def _check_number(where: str, value: object) -> None:
-    if not isinstance(value, int | float) or isinstance(value, bool):
-        shown = "null" if value is None else repr(value)
-        raise ConfigError(f"{where}={shown}: must be a number")

@@ -6,10 +6,13 @@ environment lives here; rewards, observations and terminations are functions of 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from types import SimpleNamespace
 
 import torch
 
+from kiras_rl.config import ConfigError
 from kiras_rl.envs import rotations
 from kiras_rl.envs.ground import Ground
 from kiras_rl.envs.kinematics import FootKinematics
@@ -222,6 +225,27 @@ class RobotState:
         return (self._torques >= AT_LIMIT * limit).any(dim=2).float().mean(dim=1)
 
 
+class Asked(SimpleNamespace):
+    """What the terms of `env.commands.terms` ask for, one attribute a term, (N, k) each."""
+
+    @classmethod
+    def nothing(cls, widths: Mapping[str, int], like: torch.Tensor) -> Asked:
+        """Return zeros for every row of a tensor."""
+        return cls(**{name: like.new_zeros(len(like), k) for name, k in widths.items()})
+
+    def __getitem__(self, name: str) -> torch.Tensor:
+        """Return what a term asks for by its name in the YAML, (N, k).
+
+        Raises:
+            ConfigError: No such term is configured.
+        """
+        try:
+            return getattr(self, name)
+        except AttributeError:
+            known = ", ".join(vars(self)) or "none"
+            raise ConfigError(f"env.commands.terms: no '{name}', configured: {known}") from None
+
+
 @dataclass
 class Task:
     """What each world is asked to do.
@@ -233,18 +257,30 @@ class Task:
             the skill before.
         heading: Heading that the commanded yaw rate holds, (N,), rad; NaN for none, +inf for that
             of the moment.
+        terms: What other commands ask for.
     """
 
     command: torch.Tensor
     skill: torch.Tensor
     start: torch.Tensor
     heading: torch.Tensor
+    terms: Asked = field(default_factory=Asked)
 
     @classmethod
-    def of(cls, command: torch.Tensor, skill: torch.Tensor, start: torch.Tensor) -> Task:
+    def of(
+        cls,
+        command: torch.Tensor,
+        skill: torch.Tensor,
+        start: torch.Tensor,
+        terms: Asked | None = None,
+    ) -> Task:
         """Copy commands, skills and starts; no heading is held."""
         heading = torch.full_like(command[:, 0], torch.nan)
-        return cls(command.clone(), skill.clone(), start.clone(), heading)
+        return cls(command.clone(), skill.clone(), start.clone(), heading, terms or Asked())
+
+    def tensors(self) -> dict[str, torch.Tensor]:
+        """Return all of it but what other commands ask for."""
+        return {name: value for name, value in vars(self).items() if name != "terms"}
 
 
 @dataclass(frozen=True)
@@ -333,7 +369,8 @@ class Step:
         memory: What terms remember of the steps before.
         fresh: Worlds in the first step of an episode, (N,) bool; `delta_torques` is zero there,
             for there is no torque of a step before.
-        fallen: Worlds that terminate by failure, (N,) bool.
+        fallen: Worlds that terminate by failure, (N,) bool; to a termination, those whose physics
+            broke.
         weight: Of a robot before randomization, N.
         dt: Duration of the step, s.
     """

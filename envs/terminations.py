@@ -1,38 +1,61 @@
-"""Ends of an episode by failure: one function a reason, (N,) bool. Time-outs are no failure."""
+"""Ends of an episode by failure: one pure function a reason, (Step, parameters) -> (N,) bool.
+
+Time-outs are no failure, and broken physics is one whatever is configured: neither stands here.
+"""
 
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import torch
 
-from kiras_rl.envs.state import Keyframes, RobotState, Task
-from kiras_rl.schema import TerminationConfig
+from kiras_rl.envs.lookup import find_terms
+from kiras_rl.envs.shapes import evaluate_mask
+from kiras_rl.envs.state import Step
+
+_WHERE = "env.terminations.terms"
 
 
-def fallen(
-    robot: RobotState, task: Task, keyframes: Keyframes, limits: TerminationConfig
-) -> torch.Tensor:
-    """Return the worlds that fail by any of the reasons below."""
-    cos_limit = math.cos(math.radians(limits.max_tilt))
-    pressed = base_contact(robot, limits.base_contact_force)
-    return pressed | tilted(robot, task, keyframes, cos_limit)
-
-
-def base_contact(robot: RobotState, force: float) -> torch.Tensor:
+def base_contact(step: Step, force: float) -> torch.Tensor:
     """Return the worlds whose base pressed on the ground with more than `force` N."""
-    return (robot.base_force > force).any(dim=-1)
+    return (step.robot.base_force > force).any(dim=-1)
 
 
-def tilted(robot: RobotState, task: Task, keyframes: Keyframes, cos_limit: float) -> torch.Tensor:
-    """Return the worlds whose gravity is far from that of both target and start keyframe.
+def tilted(step: Step, angle: float) -> torch.Tensor:
+    """Return the worlds whose gravity is more than `angle` degrees from both target and start."""
+    gravity, poses = step.robot.gravity_b, step.keyframes.gravity_b
+    target = (gravity * poses[step.task.skill]).sum(-1)
+    start = (gravity * poses[step.task.start]).sum(-1)
+    return torch.maximum(target, start) < math.cos(math.radians(angle))
 
-    Args:
-        robot: The robots.
-        task: Their skills and start keyframes.
-        keyframes: The skills.
-        cos_limit: Cosine of the largest angle allowed.
+
+class Terminations:
+    """The configured reasons for an episode to end by failure.
+
+    Attributes:
+        names: Of the reasons, in the order of the YAML.
+        functions: Theirs, without parameters.
     """
-    target = (robot.gravity_b * keyframes.gravity_b[task.skill]).sum(-1)
-    start = (robot.gravity_b * keyframes.gravity_b[task.start]).sum(-1)
-    return torch.maximum(target, start) < cos_limit
+
+    def __init__(self, terms: dict[str, Any]) -> None:
+        """Look the reasons up.
+
+        Raises:
+            ConfigError: Unknown reason or parameter, or a parameter that is no number.
+        """
+        self._terms = find_terms(globals(), terms, Step, _WHERE)
+        self.names = list(self._terms)
+        self.functions = [term.func for term in self._terms.values()]
+
+    def __call__(self, step: Step) -> list[torch.Tensor]:
+        """Return the worlds that end by each of the reasons, (N,) bool each.
+
+        Raises:
+            ConfigError: A term of another shape or type.
+        """
+        worlds = len(step.fallen)
+        return [
+            evaluate_mask(term, step, f"{_WHERE}.{name}", worlds)
+            for name, term in self._terms.items()
+        ]

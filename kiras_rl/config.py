@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import difflib
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict
 from functools import cache
 from pathlib import Path
@@ -46,6 +46,16 @@ OBSOLETE = tuple(
 )
 """Keys of what earlier versions saved."""
 
+MOVED = {
+    f"{phase}{old}": f"{phase}{new}"
+    for phase in ("", "finetuning.")
+    for old, new in (
+        ("env.terminations.base_contact_force", "env.terminations.terms.base_contact.force"),
+        ("env.terminations.max_tilt", "env.terminations.terms.tilted.angle"),
+    )
+}
+"""Where the values of keys of earlier versions stand now."""
+
 
 class ConfigError(ValueError):
     """A configuration that cannot be used: says what was given and what is allowed."""
@@ -68,14 +78,14 @@ def load_config(name: str, overrides: list[str] | tuple[str, ...] = ()) -> Confi
 def config_from_dict(values: dict, overrides: list[str] | tuple[str, ...] = ()) -> Config:
     """Rebuild a configuration from `config_to_dict`, with overrides.
 
-    Keys that are younger than what was saved get the values of base, and those that no longer exist
-    are left out.
+    Keys that are younger than what was saved get the values of base; those that have moved keep
+    their values, and those that no longer exist are left out.
 
     Raises:
         ConfigError: As `load_config`.
     """
     source = "the saved configuration"
-    saved = _merge(copy.deepcopy(_schema()), _without(values, OBSOLETE), source)
+    saved = _merge(copy.deepcopy(_schema()), _moved(_without(values, OBSOLETE), MOVED), source)
     younger = OmegaConf.create()
     for key in OmegaConf.missing_keys(saved):
         OmegaConf.update(younger, key, OmegaConf.select(_base(), key))
@@ -91,6 +101,15 @@ def _without(values: dict, keys: Iterable[str]) -> dict:
             block = block.get(name) or {}
         block.pop(last, None)
     return values
+
+
+def _moved(values: dict, keys: Mapping[str, str]) -> DictConfig:
+    """Return nested values with some keys, which have dots, moved to others."""
+    before, after = OmegaConf.create(values), OmegaConf.create(_without(values, keys))
+    for old, new in keys.items():
+        if (value := OmegaConf.select(before, old)) is not None:
+            OmegaConf.update(after, new, value)
+    return after
 
 
 def config_from_layers(layers: list[dict], source: str) -> Config:
@@ -244,6 +263,8 @@ def _check_keys(config: DictConfig, layer: DictConfig, source: str, prefix: str 
         if key not in allowed:
             hint = difflib.get_close_matches(str(key), allowed, n=1)
             meant = f"; did you mean '{prefix}{hint[0]}'?" if hint else "."
+            if moved := MOVED.get(f"{prefix}{key}"):
+                meant = f"; it is '{moved}' now."
             raise ConfigError(
                 f"{source}: unknown key '{prefix}{key}'{meant} Allowed: {', '.join(allowed)}"
             )

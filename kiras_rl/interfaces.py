@@ -60,6 +60,17 @@ EXTRA_FLAT = "is_flat"
 """Worlds whose ground is flat, (N,) bool."""
 
 
+EXTRA_CONSTRAINTS = "constraints"
+"""How far each of `SkillEnv.constraints` is violated, (N, C), at least 0; 0 where physics broke.
+Missing where none is configured."""
+
+FALLS, TIME_OUTS = "Episode/falls", "Episode/time_outs"
+"""Tags of the log, under which episodes that end are counted."""
+
+ENDED_BY = "Episode/ended_by_"
+"""Begin of the tags under which falls are counted by their reason; the runner logs them as shares
+of all episodes that ended."""
+
 EXTRA_PHYSICS_TIME = "physics_time"
 """How long the physics backend kept the host, s, a number."""
 
@@ -144,6 +155,9 @@ class SkillEnv(VecEnv):
     imitation_terms: tuple[tuple[str, int, float], ...]
     """Name, size and scale of each term of Phi, in their order."""
 
+    imitation_units: tuple[str, ...] = ()
+    """Unit of each of them before its scale; empty for none."""
+
     feature_noise: torch.Tensor
     """Standard deviation of one unit of discriminator input noise in each feature, (D,)."""
 
@@ -170,6 +184,9 @@ class SkillEnv(VecEnv):
 
     mass: float
     """Mass of the robot before randomization, kg."""
+
+    constraints: tuple[str, ...] = ()
+    """Names of what is measured for the parts of a learner, see EXTRA_CONSTRAINTS."""
 
     terrains: tuple[str, ...] = ()
     """Names of the terrain types; none where all ground is flat."""

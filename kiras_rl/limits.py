@@ -79,8 +79,6 @@ LIMITS = {
     "env.skills.joint_noise": Limits(0, 3),
     "env.skills.velocity_noise": Limits(0, 20),
     "env.terminations.episode_length": _POSITIVE,
-    "env.terminations.base_contact_force": _NOT_NEGATIVE,
-    "env.terminations.max_tilt": Limits(0, 180, above=True),
     "env.randomized_share": _SHARE,
     "env.randomization.friction": _FACTOR,
     "env.randomization.payload": Limits(-1000, 1000),
@@ -181,6 +179,7 @@ PARAMETERS = {
         "height": Limits(-10, 10),
         "target": Limits(0, 60),
     },
+    "env.terminations.terms": {"force": _NOT_NEGATIVE, "angle": Limits(0, 180, above=True)},
     "env.terrain.types": {"proportion": Limits(0, 1e6)},
 }
 """Of the terms of a group, by the name of their parameter."""

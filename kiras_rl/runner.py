@@ -54,6 +54,12 @@ class Evaluators:
     terrain: Callable[[Policy], TerrainResult] | None = None
 
 
+def shares_of_ends(scalars: dict[str, float]) -> dict[str, float]:
+    """Return, for each reason of falls, its count divided by that of all episodes that ended."""
+    ends = scalars.get(names.FALLS, 0.0) + scalars.get(names.TIME_OUTS, 0.0)
+    return {k: n / max(ends, 1.0) for k, n in scalars.items() if k.startswith(names.ENDED_BY)}
+
+
 class KirasRunner(OnPolicyRunner):
     """rsl-rl's runner for one phase, with self-contained checkpoints and one log per rollout.
 
@@ -180,6 +186,7 @@ class KirasRunner(OnPolicyRunner):
             "Perf/steps_per_second": steps / (learned - begin),
         }
         scalars = distributed.mean_scalars(scalars, summed=COUNTS)
+        scalars |= shares_of_ends(scalars)
         scalars |= self._evaluate_when_due()
         seconds = time.perf_counter() - begin
         self.seconds += seconds

@@ -46,7 +46,10 @@ class RewardConfig:
 
 @dataclass
 class CommandConfig:
-    """Velocity commands in the heading frame."""
+    """Velocity commands in the heading frame, and others.
+
+    `terms` holds the others: name -> {parameters of the term}; null removes one.
+    """
 
     lin_vel_x: tuple[float, float]
     lin_vel_y: tuple[float, float]
@@ -54,6 +57,7 @@ class CommandConfig:
     zero_probability: float
     resample_probability: float
     heading_gain: float
+    terms: dict[str, Any]
 
 
 @dataclass
@@ -68,17 +72,19 @@ class SkillConfig:
 
 @dataclass
 class TerminationConfig:
-    """Ends of an episode."""
+    """Ends of an episode; failures: name -> {parameters of the term}; null removes one."""
 
     episode_length: float
     random_first_length: bool
-    base_contact_force: float
-    max_tilt: float
+    terms: dict[str, Any]
 
 
 @dataclass
 class RandomizationConfig:
-    """Domain randomization: ranges [low, high]; null leaves the nominal value."""
+    """Domain randomization: ranges [low, high]; null leaves the nominal value.
+
+    `terms` holds others: name -> {parameters of the term}; null removes one, or all.
+    """
 
     friction: tuple[float, float] | None
     payload: tuple[float, float] | None
@@ -97,6 +103,7 @@ class RandomizationConfig:
     observation_delay: tuple[int, int] | None
     push_velocity: tuple[float, float] | None
     push_interval: float
+    terms: dict[str, Any] | None
 
 
 @dataclass
@@ -138,6 +145,7 @@ class EnvConfig:
     commands: CommandConfig
     skills: SkillConfig
     terminations: TerminationConfig
+    constraints: dict[str, Any]
     randomized_share: list[list[float]]
     randomization: RandomizationConfig
     terrain: TerrainConfig | None

@@ -33,6 +33,7 @@ SIMULATION = Rule(
             "kiras_rl.interfaces",
             "kiras_rl.recorded",
             "kiras_rl.config",
+            "kiras_rl.deploy.terms",  # what an observation is on the robot
             "kiras_rl.schedules",
             "kiras_rl.schema",
         ),

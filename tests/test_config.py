@@ -227,7 +227,7 @@ def test_the_page_on_configuration_shows_every_range():
         "learner.ppo.gamma=1.5",
         "learner.ppo.num_steps=1",
         "env.skills.switch_probability=7",
-        "env.terminations.max_tilt=400",
+        "env.terminations.terms.tilted.angle=400",
         "learner.ppo.action_std=[[0,0.5],[1,1000]]",
         "env.terminations.episode_length=0.001",
         "num_envs=2000000000",

@@ -193,6 +193,7 @@ def tags(smoke_run) -> set[str]:
         (rf"_({types})$", "_<type>"),
         (r"_level_\d+$", "_level_<k>"),
         (r"^Reward/.*", "Reward/<term>"),
+        (r"^Episode/ended_by_.*", "Episode/ended_by_<reason>"),
     )
     found = set()
     for tag in read_scalars(smoke_run):

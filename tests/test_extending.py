@@ -16,6 +16,7 @@ import torch
 ROOT = Path(__file__).parent.parent
 MAPPED = ("envs", "robots", "cfg", "tools")  # imported as kiras_rl.<folder>
 PAGE = (ROOT / "docs" / "extending.md").read_text(encoding="utf-8")
+SECTIONS = re.findall(r"^## (.+)$", PAGE, re.MULTILINE)
 DIFFS = re.findall(r"^```diff\n(.*?)^```", PAGE, re.MULTILINE | re.DOTALL)
 
 pytestmark = pytest.mark.skipif(shutil.which("git") is None, reason="needs git to apply diffs")
@@ -63,8 +64,14 @@ def make_env(name: str, *overrides: str):
 def test_there_is_one_diff_an_example(extended):
     import kiras_rl
 
-    assert len(DIFFS) == len(re.findall(r"^## ", PAGE, re.MULTILINE)) == 8
+    assert len(DIFFS) == len(SECTIONS)
     assert Path(kiras_rl.__file__).is_relative_to(extended)
+
+
+def test_the_table_counts_the_files_of_every_example():
+    rows = re.findall(r"^\| \[(.+?)\]\(#.+?\) \| (\d+) \|", PAGE, re.MULTILINE)
+    counted = zip(SECTIONS, (diff.count("diff --git") for diff in DIFFS), strict=True)
+    assert [(name, int(files)) for name, files in rows] == [(s.lower(), n) for s, n in counted]
 
 
 def test_a_skill_is_one_line():
@@ -108,6 +115,27 @@ def test_a_reward_may_remember_what_it_needs():
     assert landed > 5
 
 
+def test_a_termination_is_a_function_of_ones_own_and_a_line():
+    env, _ = make_env("solo8_knees", "env.terminations.random_first_length=false")
+    fell = 0
+    for _ in range(30):
+        _, _, dones, extras = env.step(6 * torch.randn(4, 8))
+        kneels = (env.robot.limb_force > 20.0).any(1)
+        assert extras["log"]["Episode/ended_by_knees"] == kneels.sum()
+        assert dones[kneels].all()
+        fell += kneels.sum()
+    assert fell > 0
+
+
+def test_a_constraint_is_a_function_of_ones_own_and_a_line():
+    env, _ = make_env("solo8_high")
+    assert env.constraints == ("low",)
+    for _ in range(10):
+        extras = env.step(6 * torch.randn(4, 8))[3]
+    below = (0.12 - env.measure().base_height).clamp(min=0.0)
+    torch.testing.assert_close(extras["constraints"], below[:, None])
+
+
 def test_an_observation_reaches_the_robot(tmp_path):
     from kiras_rl.checkpoint import load_policy
     from kiras_rl.deploy.policy import OnboardPolicy
@@ -132,6 +160,26 @@ def test_an_observation_reaches_the_robot(tmp_path):
     seen = obs["proprio"][0, -1].item()
     assert abs(seen) > 1e-3
     assert policy.frame[-1] == pytest.approx(seen, abs=1e-5)
+
+
+def test_a_randomization_is_a_function_of_ones_own_and_a_line():
+    env, _ = make_env("solo8_soft_ground")
+    constant = env.sim.state_dict()["field/geom_solref"][..., 0]
+    assert len(constant.unique()) == 4  # one a world
+    assert 0.02 <= constant.min() < constant.max() < 0.06
+    plain, _ = make_env("solo8_quick")
+    assert "field/geom_solref" not in plain.sim.state_dict()
+
+
+def test_a_command_is_a_function_of_ones_own_and_its_lines():
+    env, _ = make_env("solo8_heights")
+    for _ in range(5):
+        asked = env.task.terms["height"]
+        obs, _, _, extras = env.step(torch.randn(4, 8))
+        error = env.measure().base_height - asked[:, 0]
+        paid = 0.5 * torch.exp(-((error / 0.02) ** 2)).mean()
+        torch.testing.assert_close(extras["log"]["Reward/height"], paid)
+        torch.testing.assert_close(obs["critic"][:, -1:], 10.0 * env.task.terms["height"])
 
 
 def test_a_robot_is_a_folder():

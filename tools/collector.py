@@ -9,7 +9,6 @@ import torch
 from tensordict import TensorDict
 
 from kiras_rl.dataset import Dataset, DatasetError, Feature
-from kiras_rl.envs.observations import UNITS
 from kiras_rl.envs.quadruped import QuadrupedEnv
 from kiras_rl.evaluation.flat import Policy
 from kiras_rl.interfaces import COMMAND, EXTRA_IMITATION, Measurements
@@ -103,7 +102,7 @@ def describe_features(env: QuadrupedEnv) -> dict[str, Feature]:
         "joint_vel": feature(joints, "rad/s"),
         "joint_torque": feature(joints, "N m"),
         "foot_contact": feature(feet, "1"),
-        "imitation": _describe_imitation(env.imitation_terms, robot),
+        "imitation": _describe_imitation(env, robot),
         "command": Feature(("v_x", "v_y", "yaw_rate"), ("m/s", "m/s", "rad/s")),
         "action": feature(joints, "1"),
         "joint_target": feature(joints, "rad"),
@@ -179,7 +178,7 @@ def _assemble(
     )
 
 
-def _describe_imitation(terms: tuple[tuple[str, int, float], ...], robot: Robot) -> Feature:
+def _describe_imitation(env: QuadrupedEnv, robot: Robot) -> Feature:
     named = {
         "skill": robot.skills,
         "foot_height": robot.foot_geoms,
@@ -188,9 +187,9 @@ def _describe_imitation(terms: tuple[tuple[str, int, float], ...], robot: Robot)
         **dict.fromkeys(("joint_pos", "joint_vel", "last_action"), robot.joint_names),
     }
     names, units = [], []
-    for term, size, scale in terms:
+    for (term, size, scale), unit in zip(env.imitation_terms, env.imitation_units, strict=True):
         parts = named.get(term, range(size)) if size > 1 else ()
         names += [f"{term}.{part}" for part in parts] or [term]
-        unit = UNITS.get(term, "1")
+        unit = unit or "1"
         units += size * [unit if scale == 1.0 else f"{unit} / {scale:g}"]
     return Feature(tuple(names), tuple(units))

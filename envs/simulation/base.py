@@ -32,7 +32,7 @@ RANDOMISED_FIELDS = (
     "dof_frictionloss",
     "dof_damping",
 )
-"""Fields of MjModel that hold one value a world."""
+"""Fields of MjModel that hold one value a world in any simulation; one may be built with more."""
 
 OVERFLOW_WARNINGS = (mujoco.mjtWarning.mjWARN_CONTACTFULL, mujoco.mjtWarning.mjWARN_CNSTRFULL)
 """Warnings that mean lost contacts: the physics of that world went on without them."""
@@ -94,7 +94,7 @@ class Simulation(Protocol):
         ...
 
     def write_field(self, name: str, mask: torch.Tensor, values: torch.Tensor) -> None:
-        """Set one of RANDOMISED_FIELDS in the masked worlds; those of BODY_FIELDS belong together.
+        """Set a field that holds one value a world; those of BODY_FIELDS belong together.
 
         Args:
             name: Field of MjModel.

@@ -10,7 +10,12 @@ from kiras_rl.schema import SimConfig
 
 
 def make_simulation(
-    scene: Scene, config: SimConfig, num_worlds: int, backend: str, device: torch.device
+    scene: Scene,
+    config: SimConfig,
+    num_worlds: int,
+    backend: str,
+    device: torch.device,
+    fields: tuple[str, ...] = (),
 ) -> Simulation:
     """Build the worlds of a scene.
 
@@ -20,12 +25,13 @@ def make_simulation(
         num_worlds: How many.
         backend: "native" or "warp".
         device: Where the tensors live.
+        fields: Of MjModel, to hold one value a world beside RANDOMISED_FIELDS.
     """
     if backend == "native":
         from kiras_rl.envs.simulation.native import NativeSimulation
 
         return NativeSimulation(
-            scene.model, num_worlds, config.substeps, config.threads, scene.terrain
+            scene.model, num_worlds, config.substeps, config.threads, scene.terrain, fields
         )
     # Imported late: it takes seconds, and a CPU user never needs it.
     from kiras_rl.envs.simulation.warp import WarpSimulation
@@ -39,4 +45,5 @@ def make_simulation(
         max_constraints=config.max_constraints,
         max_ccd=config.max_ccd,
         terrain=scene.terrain,
+        fields=fields,
     )

@@ -36,6 +36,7 @@ class NativeSimulation:
         substeps: int,
         threads: int = 0,
         terrain: TerrainGeoms | None = None,
+        fields: tuple[str, ...] = (),
     ) -> None:
         """Allocate the worlds.
 
@@ -45,6 +46,7 @@ class NativeSimulation:
             substeps: Physics steps in a control step, K.
             threads: Threads of the pool; 0 for one on each core that this process may use.
             terrain: The tiles that a world may show, if the scene has any.
+            fields: Of MjModel, to hold one value a world beside RANDOMISED_FIELDS.
         """
         self.model = model = copy.copy(model)
         # A diverged world must stay visible: MuJoCo would silently reset it.
@@ -56,7 +58,9 @@ class NativeSimulation:
         # MuJoCo itself would take all cores of the machine, also those that this process may not.
         self._batch = Batch(model, num_worlds, threads or len(os.sched_getaffinity(0)))
         self._batch.reset(stage=int(mujoco.mjtStage.mjSTAGE_NONE))
-        self._fields = {name: self._batch.expand(name) for name in RANDOMISED_FIELDS}
+        self._fields = {
+            name: self._batch.expand(name) for name in dict.fromkeys((*RANDOMISED_FIELDS, *fields))
+        }
         self._bind_state()
         self._allocate_outputs()
         self._bind_terrain(terrain)
@@ -142,7 +146,7 @@ class NativeSimulation:
         self.qvel[ids] = qvel[ids]
 
     def write_field(self, name: str, mask: torch.Tensor, values: torch.Tensor) -> None:
-        """Set one of RANDOMISED_FIELDS in the masked worlds."""
+        """Set a field that holds one value a world in the masked worlds."""
         ids = mask.nonzero().squeeze(1)
         self._fields[name][ids.numpy()] = values[ids].numpy()
 

@@ -114,6 +114,7 @@ class WarpSimulation:
         max_ccd: int | None = None,
         terrain: TerrainGeoms | None = None,
         capture: bool = True,
+        fields: tuple[str, ...] = (),
     ) -> None:
         """Allocate the worlds, compile the kernels and record the launches.
 
@@ -127,7 +128,9 @@ class WarpSimulation:
             max_ccd: Pairs of a geom and a height field, the mean over all worlds.
             terrain: The tiles that a world may show, if the scene has any.
             capture: Replay recorded launches; otherwise launch kernel by kernel, for debugging.
+            fields: Of MjModel, to hold one value a world beside RANDOMISED_FIELDS.
         """
+        self._randomised = tuple(dict.fromkeys((*RANDOMISED_FIELDS, *fields)))
         self.model = model
         self.num_worlds = num_worlds
         self.device = device
@@ -148,7 +151,7 @@ class WarpSimulation:
         terrain: TerrainGeoms | None,
     ) -> None:
         n = self.num_worlds
-        fields = RANDOMISED_FIELDS + (TERRAIN_FIELDS if terrain else ())
+        fields = self._randomised + (TERRAIN_FIELDS if terrain else ())
         sizes: dict[str, int] = dict.fromkeys(fields, n)
         model, columns = _without_contact_sensors(self.model)
         self._m = mjw.put_model(model, batch_sizes=sizes)
@@ -178,7 +181,7 @@ class WarpSimulation:
         self.overflowed = torch.zeros(self.num_worlds, dtype=torch.bool, device=self.device)
         self.diverged = torch.zeros_like(self.overflowed)
         self._monitor = OverflowMonitor(_BUDGETS, self.num_worlds, self.device)
-        self._fields = {name: wp.to_torch(getattr(self._m, name)) for name in RANDOMISED_FIELDS}
+        self._fields = {name: wp.to_torch(getattr(self._m, name)) for name in self._randomised}
         self._state = {
             "qpos": self.qpos,
             "qvel": self.qvel,
@@ -284,7 +287,7 @@ class WarpSimulation:
         _write(self.qvel, mask, qvel)
 
     def write_field(self, name: str, mask: torch.Tensor, values: torch.Tensor) -> None:
-        """Set one of RANDOMISED_FIELDS in the masked worlds."""
+        """Set a field that holds one value a world in the masked worlds."""
         _write(self._fields[name], mask, values)
 
     def write_terrain(self, mask: torch.Tensor, tile: torch.Tensor) -> None:

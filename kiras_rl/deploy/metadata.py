@@ -6,7 +6,12 @@ import json
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+from kiras_rl.deploy.terms import Reading, find_rebuild
+
+if TYPE_CHECKING:
+    from kiras_rl.deploy.terms import Rebuild
 
 from kiras_rl.deploy.profile import Profile
 
@@ -20,11 +25,28 @@ class PolicyError(ValueError):
 
 @dataclass(frozen=True)
 class ObservationTerm:
-    """One block of a frame: `size` numbers, each multiplied by `scale`."""
+    """One block of a frame: `size` numbers, each multiplied by `scale`.
+
+    `onboard` is what rebuilds it from a reading, see `kiras_rl.deploy.terms`; by its own name where
+    it is None.
+    """
 
     name: str
     size: int
     scale: float
+    onboard: str | None = None
+
+    def rebuild(self) -> Rebuild:
+        """Return what rebuilds the term.
+
+        Raises:
+            PolicyError: There is nothing.
+        """
+        try:
+            return find_rebuild(self.onboard or self.name)
+        except LookupError as error:
+            known = error.args[0]
+        raise PolicyError(f"policy metadata: unknown observation term '{self.name}'; {known}")
 
 
 @dataclass(frozen=True)
@@ -43,22 +65,6 @@ class CommandRange:
     lin_vel_x: tuple[float, float]
     lin_vel_y: tuple[float, float]
     ang_vel_z: tuple[float, float]
-
-
-def _term_sizes(joints: int, skills: int) -> dict[str, int]:
-    """Width of every observation term that can be rebuilt on a robot."""
-    return {
-        "projected_gravity": 3,
-        "pitch": 1,
-        "base_ang_vel": 3,
-        "command_lin_vel_x": 1,
-        "command_lin_vel_y": 1,
-        "command_ang_vel_z": 1,
-        "skill": skills,
-        "joint_pos": joints,
-        "joint_vel": joints,
-        "last_action": joints,
-    }
 
 
 @dataclass(frozen=True)
@@ -129,7 +135,11 @@ class PolicyMetadata:
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain dicts, tuples and numbers, with the format number."""
-        return {"format": FORMAT, **asdict(self)}
+        values = asdict(self)
+        for term in values["observation"]:
+            if term["onboard"] is None:
+                del term["onboard"]
+        return {"format": FORMAT, **values}
 
     def to_json(self) -> str:
         """Return the JSON text that travels in the policy file."""
@@ -204,16 +214,13 @@ class PolicyMetadata:
             )
 
     def _check_observation(self) -> None:
-        sizes = _term_sizes(self.num_joints, len(self.skills))
+        example = Reading.example(self.num_joints, len(self.skills))
         _require(len(self.observation) > 0, "no observation terms")
         for term in self.observation:
+            size = len(term.rebuild()(example))
             _require(
-                term.name in sizes,
-                f"unknown observation term '{term.name}'; known: {', '.join(sizes)}",
-            )
-            _require(
-                term.size == sizes[term.name],
-                f"observation term '{term.name}' has size {term.size}, expected {sizes[term.name]}",
+                term.size == size,
+                f"observation term '{term.name}' has size {term.size}, expected {size}",
             )
 
 
@@ -248,7 +255,9 @@ def _names(values: Sequence[Any]) -> tuple[str, ...]:
 
 def _terms(values: Sequence[Mapping[str, Any]]) -> tuple[ObservationTerm, ...]:
     return tuple(
-        ObservationTerm(str(term["name"]), int(term["size"]), _number(term["scale"]))
+        ObservationTerm(
+            str(term["name"]), int(term["size"]), _number(term["scale"]), term.get("onboard")
+        )
         for term in values
     )
 

@@ -5,9 +5,7 @@ from __future__ import annotations
 import difflib
 import operator
 import os
-from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -15,30 +13,16 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from kiras_rl.deploy.metadata import METADATA_KEY, PolicyError, PolicyMetadata
+from kiras_rl.deploy.terms import Reading
+from kiras_rl.deploy.terms import gravity as projected_gravity
 
 if TYPE_CHECKING:
     import onnxruntime
 
-__all__ = ["OnboardPolicy", "PolicyError", "PolicyMetadata"]
+__all__ = ["OnboardPolicy", "PolicyError", "PolicyMetadata", "projected_gravity"]
 
 LARGEST_READING = 1000.0
 """rad, rad/s, m/s: beyond what joints, gyroscopes and commands can be; a driver's fault."""
-
-
-@dataclass(frozen=True)
-class Reading:
-    """What one frame is built from, checked.
-
-    As in `OnboardPolicy.step`, but `joint_pos` is relative to the default pose and `skill` one-hot.
-    """
-
-    joint_pos: np.ndarray
-    joint_vel: np.ndarray
-    imu_quat: np.ndarray
-    base_ang_vel: np.ndarray
-    command: np.ndarray
-    skill: np.ndarray
-    last_action: np.ndarray
 
 
 class OnboardPolicy:
@@ -71,9 +55,10 @@ class OnboardPolicy:
         self._scale = np.array(meta.action_scale)
         limits = meta.joint_limits or [(-np.inf, np.inf)] * meta.num_joints
         self._low, self._high = np.array(limits).T
-        self._terms = [(_TERMS[term.name], term.scale) for term in meta.observation]
+        self._terms = [(term.rebuild(), term.scale) for term in meta.observation]
         self._one_hot = np.eye(len(meta.skills))
         self._started = False
+        self._steps = 0
         self.action = np.zeros(meta.num_joints)
         self.velocity = np.zeros(3)
         self.frame = np.zeros(meta.frame_size, np.float32)
@@ -89,6 +74,7 @@ class OnboardPolicy:
         self.action = (joint_pos - self._default) / self._scale  # the action that holds this pose
         self.velocity = np.zeros(3)
         self._started = False
+        self._steps = 0
 
     def step(
         self,
@@ -125,8 +111,10 @@ class OnboardPolicy:
             command=self._vector("command", command, 3),
             skill=self._one_hot[self.skill_index(skill)],
             last_action=self.action,
+            time=self._steps / self.metadata.control_rate,
         )
         self._remember(self._observe(reading))
+        self._steps += 1
         return self._act()
 
     def skill_index(self, skill: str | int) -> int:
@@ -209,32 +197,6 @@ def _unit(quat: np.ndarray) -> np.ndarray:
     if not 0.5 <= norm <= 2.0:  # a sensor that is not ready sends zeros; rounding is far from this
         raise PolicyError(f"imu_quat is not a rotation: {quat}")
     return quat / norm
-
-
-def projected_gravity(quat: np.ndarray) -> np.ndarray:
-    """Direction of gravity in the base frame, (3,): the rotation's third row, negated."""
-    w, x, y, z = quat
-    return -np.array([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)])
-
-
-def pitch(quat: np.ndarray) -> float:
-    """Pitch in rad, positive = nose down."""
-    w, x, y, z = quat
-    return float(np.arcsin(np.clip(2 * (w * y - x * z), -1.0, 1.0)))
-
-
-_TERMS: dict[str, Callable[[Reading], np.ndarray]] = {
-    "projected_gravity": lambda r: projected_gravity(r.imu_quat),
-    "pitch": lambda r: np.array([pitch(r.imu_quat)]),
-    "base_ang_vel": lambda r: r.base_ang_vel,
-    "command_lin_vel_x": lambda r: r.command[0:1],
-    "command_lin_vel_y": lambda r: r.command[1:2],
-    "command_ang_vel_z": lambda r: r.command[2:3],
-    "skill": lambda r: r.skill,
-    "joint_pos": lambda r: r.joint_pos,
-    "joint_vel": lambda r: r.joint_vel,
-    "last_action": lambda r: r.last_action,
-}
 
 
 def _open_session(path: Path) -> onnxruntime.InferenceSession:

@@ -6,7 +6,7 @@ import pytest
 
 from kiras_rl.config import load_config
 from kiras_rl.envs import make_env
-from kiras_rl.phases import SKILL_LEARNING, phase_config
+from kiras_rl.phases import SKILL_LEARNING, phase_of
 from kiras_rl.runner import KirasRunner
 
 TINY = (
@@ -28,7 +28,8 @@ def make_runner(tmp_path):
 
     def make(cfg, run, *overrides, phase=SKILL_LEARNING):
         config = load_config(f"baselines/{cfg}", [*TINY, *SMALL[cfg], *overrides])
-        env = make_env(phase_config(config, phase))
-        return KirasRunner(env, config, tmp_path / run, "cpu", phase=phase)
+        resolved = phase_of(config, phase)
+        env = make_env(resolved.config)
+        return KirasRunner(env, resolved, tmp_path / run, "cpu")
 
     return make

@@ -270,7 +270,7 @@ def test_a_fall_ends_an_episode_and_is_no_time_out(env):
 
 
 def test_a_trunk_on_the_ground_is_a_fall(robot, build_env):
-    env = build_env(f"robot={robot.name}", "env.terminations.max_tilt=180", num_envs=3)
+    env = build_env(f"robot={robot.name}", "env.terminations.terms.tilted.angle=180", num_envs=3)
     env.reset(torch.zeros(3, dtype=torch.int64), torch.zeros(3, 3))
     place(env, [1], height=0.15, quat=UPSIDE_DOWN)  # legs up: the trunk comes down first
     fallen = torch.zeros(3, dtype=torch.bool)
@@ -281,7 +281,7 @@ def test_a_trunk_on_the_ground_is_a_fall(robot, build_env):
 
 
 def test_a_lean_is_judged_from_the_nearer_of_target_and_start(build_env, nominal):
-    env = build_env("env.terminations.max_tilt=20", *STILL, *nominal, num_envs=4)
+    env = build_env("env.terminations.terms.tilted.angle=20", *STILL, *nominal, num_envs=4)
     pitch_up = torch.full((4,), env.skills.index("pitch_up"))
     env.reset(pitch_up, torch.zeros(4, 3))  # 15 degrees nose up
     env.set_task(torch.tensor([3, 4, 0, 4]), torch.zeros(4, 3))  # itself, or 30 degrees away
@@ -297,7 +297,7 @@ def test_a_lean_is_judged_from_the_nearer_of_target_and_start(build_env, nominal
 
 
 def test_a_lean_that_was_asked_for_before_is_no_fall(build_env, nominal):
-    env = build_env("env.terminations.max_tilt=10", *STILL, *nominal, num_envs=1)
+    env = build_env("env.terminations.terms.tilted.angle=10", *STILL, *nominal, num_envs=1)
     walk, pitch_down = (torch.tensor([env.skills.index(x)]) for x in ("walk", "pitch_down"))
     env.reset(walk, torch.zeros(1, 3))
     env.set_task(pitch_down, torch.zeros(1, 3))

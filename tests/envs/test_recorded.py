@@ -8,11 +8,18 @@ from kiras_rl.envs import make_env
 from kiras_rl.phases import FINETUNING, SKILL_LEARNING, phase_of
 from kiras_rl.recorded import Recorded
 
+TERMS = (
+    "env.commands.terms.clock={frequency: [1.0, 3.0]}",
+    "env.constraints.joint_speed={most: 1.0}",
+    "env.randomization.terms={armature: {factor: [0.5, 2.0]}}",
+)
+"""Terms that no configuration has, of kinds that a step reads, keeps or writes."""
 
-def build(cfg, phase, device):
+
+def build(cfg, phase, device, *overrides):
     small = ("num_envs=6", "env.terminations.episode_length=0.3", "sim.backend=warp")
     terrain = "finetuning.env.terrain={levels: 2, variants: 1}"
-    config = load_config(cfg, [*small, terrain, f"device={device}"])
+    config = load_config(cfg, [*small, terrain, f"device={device}", *overrides])
     return make_env(phase_of(config, phase).config, device)
 
 
@@ -78,10 +85,12 @@ def play(env, steps):
     env.sim.step = step
 
 
-@pytest.mark.parametrize("phase", [SKILL_LEARNING, FINETUNING])
+@pytest.mark.parametrize(
+    ("phase", "overrides"), [(SKILL_LEARNING, ()), (FINETUNING, ()), (SKILL_LEARNING, TERMS)]
+)
 @pytest.mark.parametrize("device", ["cpu", pytest.param("cuda", marks=pytest.mark.gpu)])
-def test_replayed_steps_are_the_same(phase, device, request):
-    plain, replayed = build("solo8", phase, device), build("solo8", phase, device)
+def test_replayed_steps_are_the_same(phase, overrides, device, request):
+    plain, replayed = (build("solo8", phase, device, *overrides) for _ in range(2))
     plain._advance.records = False
     replayed._advance.records = True
     if device == "cpu":

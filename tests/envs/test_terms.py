@@ -7,6 +7,7 @@ import torch
 
 from kiras_rl.config import ConfigError, load_config
 from kiras_rl.envs import observations, rewards
+from kiras_rl.envs.memory import Memory, remembering
 from kiras_rl.phases import plan
 from kiras_rl.runner import KirasRunner
 from kiras_rl.soundness import TrainingError
@@ -70,3 +71,15 @@ def test_a_term_without_a_number_is_named(where, monkeypatch):
         TrainingError, match=r"not finite: (Reward/|env\.observations\.critic\.)broken"
     ):
         runner.learn(1)
+
+
+def test_two_memories_of_one_name_are_refused():
+    def air_time(before, step):
+        return before
+
+    @remembering(air_time)
+    def mine(step):
+        return step.memory[air_time][:, 0]
+
+    with pytest.raises(ConfigError, match="two terms remember different things as 'air_time'"):
+        Memory([mine, rewards.short_swing], 4, 4, torch.device("cpu"))

@@ -39,10 +39,11 @@ ROUGH = (
 def make_env():
     """Return a function that builds the evaluation environment of `smoke`, nominal or not."""
 
-    def make(num_envs, nominal=True, duration=2.0, *overrides, phase=SKILL_LEARNING):
+    def make(num_envs, nominal=True, duration=2.0, *overrides, phase=SKILL_LEARNING, tilt=60.0):
         config = load_config("smoke", ["sim.backend=native", *overrides])
-        config = phase_of(config, phase).config
-        return make_evaluation_env(evaluation_physics(config, nominal), num_envs, duration)
+        config = evaluation_physics(phase_of(config, phase).config, nominal)
+        config.env.terminations.terms["tilted"]["angle"] = tilt
+        return make_evaluation_env(config, num_envs, duration)
 
     return make
 
@@ -194,8 +195,7 @@ def test_what_is_read_back_is_what_was_recorded(dataset, name, tmp_path):
 def test_an_episode_ends_before_the_fall_that_its_last_step_led_to(make_env):
     """Actions that are out of range are clipped, and throw the robots over."""
     plan = Plan(("walk",), 4, 2.0, FORWARD, seed=1)
-    env = make_env(4)
-    env.cfg.terminations.max_tilt = 20.0  # degrees: targets within joint limits throw them less far
+    env = make_env(4, tilt=20.0)  # degrees: targets within joint limits throw them less far
     wild = 100.0 * torch.sign(torch.randn(200, 4, 8, generator=torch.Generator().manual_seed(0)))
     moves = iter(wild)
     dataset = collect(env, lambda obs: next(moves), plan, {})
@@ -208,8 +208,7 @@ def test_an_episode_ends_before_the_fall_that_its_last_step_led_to(make_env):
 
 
 def test_robots_that_all_fall_at_once_leave_no_dataset(make_env):
-    env = make_env(2, duration=0.02)
-    env.cfg.terminations.max_tilt = 0.0  # degrees: nobody stands that straight
+    env = make_env(2, duration=0.02, tilt=0.0)  # degrees: nobody stands that straight
     with pytest.raises(DatasetError, match="no episodes: every robot fell"):
         collect(env, lambda obs: torch.zeros(2, 8), Plan(("walk",), 2, 0.1, FORWARD, 1), {})
 

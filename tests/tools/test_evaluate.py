@@ -163,7 +163,7 @@ def test_a_robot_without_terrain_of_its_own_has_none_to_cross(
 
 def test_what_counts_as_a_fall_is_the_robot_s_standard():
     standard = load_config("solo8")
-    trained = load_config("solo8", ["env.terminations.max_tilt=3.0"])
+    trained = load_config("solo8", ["env.terminations.terms.tilted.angle=3.0"])
     assert evaluation_physics(trained, False).env.terminations == standard.env.terminations
 
 
