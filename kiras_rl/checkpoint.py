@@ -12,6 +12,7 @@ import torch
 
 from kiras_rl import __version__, distributed
 from kiras_rl.config import ConfigError
+from kiras_rl.deploy.errors import PlainError
 from kiras_rl.files import CheckedFile, replacing
 from kiras_rl.models.exported import ExportedPolicy, build_policy
 
@@ -34,7 +35,7 @@ _UNREADABLE = (
 )
 
 
-class CheckpointError(ValueError):
+class CheckpointError(PlainError, ValueError):
     """A file that is no usable checkpoint: says which and why."""
 
 

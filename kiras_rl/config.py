@@ -13,6 +13,7 @@ from typing import Any, TypeVar
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from kiras_rl.deploy.errors import PlainError
 from kiras_rl.files import replacing
 from kiras_rl.limits import find_outside_fields
 from kiras_rl.ranges import find_mistake
@@ -25,7 +26,7 @@ CFG_FOLDER = Path(__file__).resolve().parent / "cfg"
 if not CFG_FOLDER.is_dir():  # an editable install: kiras_rl.cfg is the top-level folder cfg/
     CFG_FOLDER = Path(__file__).resolve().parents[1] / "cfg"
 BASE = CFG_FOLDER / "base.yaml"
-SWEEP_FOLDER = CFG_FOLDER / "sweeps"  # lists of runs, see kiras_rl.tools.sweep
+SWEEP_FOLDER = CFG_FOLDER / "sweeps"  # lists of runs, see kiras_rl.tools.training.sweep
 
 MACHINE_KEYS = ("device", "sim.threads", "checkpoint_minutes")
 """Keys about the machine that trains: none of them makes a run another experiment."""
@@ -57,7 +58,7 @@ MOVED = {
 """Where the values of keys of earlier versions stand now."""
 
 
-class ConfigError(ValueError):
+class ConfigError(PlainError, ValueError):
     """A configuration that cannot be used: says what was given and what is allowed."""
 
 

@@ -18,6 +18,8 @@ from typing import Any
 
 import numpy as np
 
+from kiras_rl.deploy.errors import PlainError
+
 FORMAT = 1
 FORMATS = ("npz", "lerobot")
 HEADER, ARRAYS = "dataset.json", "dataset.npz"
@@ -28,7 +30,7 @@ LABELS = {"episode": np.int64, "skill": np.int64, "done": np.bool_, "fallen": np
 Transitions = tuple[np.ndarray, np.ndarray]
 
 
-class DatasetError(ValueError):
+class DatasetError(PlainError, ValueError):
     """A dataset that cannot be read or written; the message says why."""
 
 

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import nn
 
+from kiras_rl.deploy.errors import PlainError
 from kiras_rl.deploy.metadata import METADATA_KEY, PolicyMetadata
 from kiras_rl.files import replacing
 
@@ -27,7 +28,7 @@ _OPSET = 18  # of the exporter
 _LEAST_OPSET = 13  # which onnxruntime runs from version 1.6 on
 
 
-class ExportError(ValueError):
+class ExportError(PlainError, ValueError):
     """A policy that cannot be exported; the message says why."""
 
 

@@ -11,13 +11,14 @@ from rsl_rl.utils import check_nan
 from tensordict import TensorDict
 
 from kiras_rl import distributed
+from kiras_rl.deploy.errors import PlainError
 
 NameTerm = Callable[[str, int], str]
 LOSSES = ("Loss/", "Policy/", "Estimator/", "Discriminator/")
 """Tags of an update that are numbers as long as its weights are."""
 
 
-class TrainingError(ValueError):
+class TrainingError(PlainError, ValueError):
     """A training that cannot go on: says where it broke and what is left."""
 
 

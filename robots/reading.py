@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from kiras_rl.deploy.errors import PlainError
 from kiras_rl.yaml_files import YamlError, read_yaml_file
 
 RANGES = {
@@ -47,7 +48,7 @@ RANGES = {
 """Of a key's numbers: least, largest, and whether the least itself is too little."""
 
 
-class RobotError(ValueError):
+class RobotError(PlainError, ValueError):
     """A robot's files or its name are wrong; the text says where and what is allowed."""
 
 

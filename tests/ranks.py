@@ -16,7 +16,7 @@ from kiras_rl.config import load_config
 from kiras_rl.phases import FINETUNING, SKILL_LEARNING, phase_of, plan
 from kiras_rl.runner import KirasRunner
 from kiras_rl.tools.train import main
-from kiras_rl.tools.training import build
+from kiras_rl.tools.training.run import build
 
 WORLDS, STEPS = 4, 24  # of each rank
 

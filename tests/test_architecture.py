@@ -33,6 +33,7 @@ SIMULATION = Rule(
             "kiras_rl.interfaces",
             "kiras_rl.recorded",
             "kiras_rl.config",
+            "kiras_rl.deploy.errors",
             "kiras_rl.deploy.terms",  # what an observation is on the robot
             "kiras_rl.schedules",
             "kiras_rl.schema",
@@ -48,7 +49,7 @@ RULES = {  # the longest name that fits a module counts
     "kiras_rl.graphics": Rule(("mujoco",)),
     "kiras_rl.ownership": LEARNING._replace(may=(*LEARNING.may, "filelock")),
     "kiras_rl.recorded": Rule(("torch",)),
-    "kiras_rl.dataset": Rule(("numpy", "kiras_rl.lerobot")),
+    "kiras_rl.dataset": Rule(("numpy", "kiras_rl.lerobot", "kiras_rl.deploy.errors")),
     "kiras_rl.lerobot": Rule(("numpy", "pyarrow", "kiras_rl.dataset")),
     "kiras_rl.deploy": Rule(("numpy", "onnxruntime", "kiras_rl.deploy")),
     "kiras_rl.deploy.runtime.profiles": Rule(("kiras_rl.deploy", "kiras_rl.robots.robot")),
@@ -56,7 +57,11 @@ RULES = {  # the longest name that fits a module counts
         ("numpy", "mujoco", "kiras_rl.deploy", "kiras_rl.robots")
     ),
     "kiras_rl.robots": Rule(
-        ("numpy", "mujoco", "kiras_rl.robots", "kiras_rl.yaml_files", "kiras_rl.graphics")
+        (
+            *("numpy", "mujoco"),
+            *("kiras_rl.robots", "kiras_rl.yaml_files", "kiras_rl.graphics"),
+            "kiras_rl.deploy.errors",
+        )
     ),
     "kiras_rl.envs": SIMULATION,
     "kiras_rl.envs.simulation.warp": Rule((*SIMULATION.may, "warp", "mujoco_warp")),

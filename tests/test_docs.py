@@ -22,8 +22,8 @@ from kiras_rl.envs.state import Step
 from kiras_rl.phases import FINETUNING, phase_of
 from kiras_rl.robots.onboard import KEYS, read_onboard
 from kiras_rl.robots.robot import load_robot
-from kiras_rl.tools.curves import read_scalars
-from kiras_rl.tools.sweep import load_sweep
+from kiras_rl.tools.training.curves import read_scalars
+from kiras_rl.tools.training.sweep import load_sweep
 
 ROOT = Path(__file__).parent.parent
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]

@@ -12,9 +12,9 @@ from kiras_rl.envs import make_env
 from kiras_rl.export import export_policy
 from kiras_rl.phases import plan
 from kiras_rl.runner import KirasRunner
-from kiras_rl.tools.driver import Driver
-from kiras_rl.tools.evaluator import make_evaluators
-from kiras_rl.tools.script import Segment, record
+from kiras_rl.tools.driving.driver import Driver
+from kiras_rl.tools.driving.script import Segment, record
+from kiras_rl.tools.evaluation.evaluator import make_evaluators
 
 pytestmark = pytest.mark.slow
 

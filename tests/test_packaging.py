@@ -41,7 +41,8 @@ def test_every_package_has_an_init_file():
 
 
 @pytest.mark.parametrize(
-    "package", ["kiras_rl.robots", "kiras_rl.cfg", "kiras_rl.tools.viewer", "kiras_rl.baselines"]
+    "package",
+    ["kiras_rl.robots", "kiras_rl.cfg", "kiras_rl.tools.driving.viewer", "kiras_rl.baselines"],
 )
 def test_every_data_file_is_covered_by_a_pattern(package):
     top, _, inner = package.removeprefix("kiras_rl.").partition(".")

@@ -18,8 +18,8 @@ from patience import patience
 
 from kiras_rl.checkpoint import load_checkpoint, save_checkpoint
 from kiras_rl.phases import FINETUNING, SKILL_LEARNING
-from kiras_rl.tools.curves import read_scalars
-from kiras_rl.tools.training import resume
+from kiras_rl.tools.training.curves import read_scalars
+from kiras_rl.tools.training.run import resume
 
 pytestmark = pytest.mark.slow  # a process a rank, and many trainings
 

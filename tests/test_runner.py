@@ -20,7 +20,7 @@ from kiras_rl.phases import FINETUNING, SKILL_LEARNING, phase_of, plan
 from kiras_rl.process import StopRequest
 from kiras_rl.runner import Evaluators, KirasRunner
 from kiras_rl.soundness import TrainingError
-from kiras_rl.tools.curves import read_scalars
+from kiras_rl.tools.training.curves import read_scalars
 
 # Noise, randomization and delay are on; episodes and premium windows end many times.
 TINY = (

@@ -6,7 +6,7 @@ import pytest
 
 from kiras_rl.config import ConfigError, load_config
 from kiras_rl.robots.robot import RobotError
-from kiras_rl.tools.sweep import load_sweep
+from kiras_rl.tools.training.sweep import load_sweep
 from kiras_rl.yaml_files import YamlError, read_yaml_file, read_yaml_text
 
 

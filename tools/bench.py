@@ -19,11 +19,8 @@ from rich.table import Table
 
 from kiras_rl import checkpoint
 from kiras_rl.config import ConfigError, load_config
-from kiras_rl.deploy.policy import PolicyError
 from kiras_rl.files import replacing
-from kiras_rl.robots.robot import RobotError
 from kiras_rl.schema import Config
-from kiras_rl.tools.arguments import at_least
 from kiras_rl.tools.benchmarks import (
     bound,
     contacts,
@@ -38,9 +35,10 @@ from kiras_rl.tools.benchmarks import (
 )
 from kiras_rl.tools.benchmarks.request import Figures, Request
 from kiras_rl.tools.benchmarks.tables import STYLE
-from kiras_rl.tools.ending import finish
-from kiras_rl.tools.outputs import check_output, save_figure
-from kiras_rl.tools.training import resolve_device
+from kiras_rl.tools.shared.arguments import at_least
+from kiras_rl.tools.shared.ending import finish
+from kiras_rl.tools.shared.outputs import check_output, save_figure
+from kiras_rl.tools.training.run import resolve_device
 
 DESCRIPTION = """\
 Measure how fast training is here and what each part of it costs. Absolute times depend on the
@@ -112,7 +110,7 @@ console = Console()
 def main(argv: list[str] | None = None) -> int:
     """Run the command; return its exit code."""
     args = _parse(argv)
-    return finish(lambda: bench(args), (ConfigError, PolicyError, RobotError))
+    return finish(lambda: bench(args))
 
 
 def _parse(argv: list[str] | None) -> argparse.Namespace:

@@ -13,23 +13,22 @@ from rich.table import Table
 
 from kiras_rl.checkpoint import versions
 from kiras_rl.config import ConfigError
-from kiras_rl.dataset import FORMATS, Dataset, DatasetError, check_target, save_dataset
+from kiras_rl.dataset import FORMATS, Dataset, check_target, save_dataset
 from kiras_rl.deploy.policy import PolicyError, PolicyMetadata
 from kiras_rl.phases import plan
-from kiras_rl.robots.robot import RobotError
 from kiras_rl.schema import Config
-from kiras_rl.tools.arguments import at_least, seconds_above
-from kiras_rl.tools.collector import Plan, Range, collect
-from kiras_rl.tools.console import make_console
-from kiras_rl.tools.ending import finish
-from kiras_rl.tools.evaluator import (
+from kiras_rl.tools.driving.collector import Plan, Range, collect
+from kiras_rl.tools.driving.ground import Terrain
+from kiras_rl.tools.evaluation.evaluator import (
     evaluation_physics,
     make_evaluation_env,
     onboard_policy,
     trained_config,
 )
-from kiras_rl.tools.ground import Terrain
-from kiras_rl.tools.policy_files import load_policy, robot_of
+from kiras_rl.tools.shared.arguments import at_least, seconds_above
+from kiras_rl.tools.shared.console import make_console
+from kiras_rl.tools.shared.ending import finish
+from kiras_rl.tools.shared.policy_files import load_policy, robot_of
 
 DESCRIPTION = """\
 Record episodes of a policy, without action noise, as a dataset: base, joints, torques, contacts,
@@ -52,7 +51,6 @@ then, in Python:
   dataset = kiras_rl.dataset.load_dataset("walks")
 """
 
-MISTAKES = (ConfigError, DatasetError, PolicyError, RobotError)
 """Errors whose message is all that a user needs."""
 
 MANY = ("npz", "lerobot", "both")
@@ -70,7 +68,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         console.print(_summary(dataset, args.episodes))
         console.print(f"{args.out}: {len(dataset)} frames at {dataset.rate:g} Hz", soft_wrap=True)
 
-    return finish(work, MISTAKES, stopped="interrupted: nothing was written")
+    return finish(work, stopped="interrupted: nothing was written")
 
 
 def _parse(argv: Sequence[str] | None) -> argparse.Namespace:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from importlib import import_module
 
-from kiras_rl.tools.ending import finish
+from kiras_rl.tools.shared.ending import finish
 
 
 def bench(argv: list[str] | None = None) -> int:

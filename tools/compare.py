@@ -15,13 +15,13 @@ from kiras_rl.tools.evaluate import (
     measure,
     options_of,
 )
-from kiras_rl.tools.protocols import PROTOCOLS
-from kiras_rl.tools.protocols.pooling import pool
-from kiras_rl.tools.protocols.subject import Options, Subject
-from kiras_rl.tools.report.about import about_table
-from kiras_rl.tools.report.content import Section
-from kiras_rl.tools.report.files import check_page, write_report
-from kiras_rl.tools.report.terminal import as_rich
+from kiras_rl.tools.evaluation.protocols import PROTOCOLS
+from kiras_rl.tools.evaluation.protocols.pooling import pool
+from kiras_rl.tools.evaluation.protocols.subject import Options, Subject
+from kiras_rl.tools.evaluation.report.about import about_table
+from kiras_rl.tools.evaluation.report.content import Section
+from kiras_rl.tools.evaluation.report.files import check_page, write_report
+from kiras_rl.tools.evaluation.report.terminal import as_rich
 
 DESCRIPTION = """\
 Measure several policies by the protocols of kiras-evaluate and set them side by side: tables are

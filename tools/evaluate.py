@@ -9,22 +9,18 @@ from pathlib import Path
 
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 
-from kiras_rl.checkpoint import CheckpointError
-from kiras_rl.config import ConfigError
-from kiras_rl.deploy.metadata import PolicyError
 from kiras_rl.evaluation.flat import SETTLE
-from kiras_rl.robots.robot import RobotError
-from kiras_rl.tools.arguments import at_least, seconds_above
-from kiras_rl.tools.console import make_console
-from kiras_rl.tools.ending import finish
-from kiras_rl.tools.protocols import PROTOCOLS, known
-from kiras_rl.tools.protocols.subject import Options, Subject
-from kiras_rl.tools.protocols.terrain import LEVELS
-from kiras_rl.tools.report.about import about_table
-from kiras_rl.tools.report.content import Section
-from kiras_rl.tools.report.files import check_page, write_report
-from kiras_rl.tools.report.terminal import as_rich
-from kiras_rl.tools.training import resolve_device
+from kiras_rl.tools.evaluation.protocols import PROTOCOLS, known
+from kiras_rl.tools.evaluation.protocols.subject import Options, Subject
+from kiras_rl.tools.evaluation.protocols.terrain import LEVELS
+from kiras_rl.tools.evaluation.report.about import about_table
+from kiras_rl.tools.evaluation.report.content import Section
+from kiras_rl.tools.evaluation.report.files import check_page, write_report
+from kiras_rl.tools.evaluation.report.terminal import as_rich
+from kiras_rl.tools.shared.arguments import at_least, seconds_above
+from kiras_rl.tools.shared.console import make_console
+from kiras_rl.tools.shared.ending import finish
+from kiras_rl.tools.training.run import resolve_device
 
 DESCRIPTION = """\
 Measure a policy without action noise, through the code that runs on the robot, on robots drawn by
@@ -48,7 +44,6 @@ examples:
   kiras-evaluate policy.onnx --protocol heat_map   twenty minutes on two CPU cores
 """
 
-MISTAKES = (CheckpointError, ConfigError, OSError, PolicyError, RobotError)
 """Errors whose message is all that a user needs; what a file or folder refuses is one."""
 
 ALL = list(PROTOCOLS)
@@ -73,7 +68,7 @@ def exit_code(work: Callable[[], object]) -> int:
     def measure_and_write() -> None:
         work()
 
-    return finish(measure_and_write, MISTAKES, "stopped; the same command goes on from here")
+    return finish(measure_and_write, "stopped; the same command goes on from here")
 
 
 def evaluate(subject: Subject, names: list[str]) -> Path:

@@ -12,11 +12,10 @@ import numpy as np
 from rich.table import Table
 
 from kiras_rl.deploy.policy import OnboardPolicy, PolicyError, PolicyMetadata
-from kiras_rl.robots.robot import RobotError
-from kiras_rl.tools import policy_files
-from kiras_rl.tools.console import make_console
-from kiras_rl.tools.ending import finish
-from kiras_rl.tools.outputs import OutputError, check_output
+from kiras_rl.tools.shared import policy_files
+from kiras_rl.tools.shared.console import make_console
+from kiras_rl.tools.shared.ending import finish
+from kiras_rl.tools.shared.outputs import OutputError, check_output
 
 _DESCRIPTION = """\
 Write the policy of a training run as one ONNX file with everything a robot needs: network, joint
@@ -53,7 +52,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("source", type=Path, metavar="RUN|CHECKPOINT|ONNX", help="as above")
     parser.add_argument("--out", type=Path, metavar="FILE", help="file to write")
     options = parser.parse_args(arguments)
-    return finish(lambda: _export(options.source, options.out), (PolicyError, RobotError))
+    return finish(lambda: _export(options.source, options.out))
 
 
 def _export(source: Path, out: Path | None) -> None:

@@ -15,13 +15,13 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from rich.table import Table
 
-from kiras_rl.robots.robot import Keyframe, Robot, RobotError, load_robot
+from kiras_rl.robots.robot import Keyframe, Robot, load_robot
 from kiras_rl.robots.statics import KeyframeReport, examine_keyframe
-from kiras_rl.tools.arguments import PICTURES, file_of
-from kiras_rl.tools.console import make_console
-from kiras_rl.tools.ending import finish
-from kiras_rl.tools.outputs import check_output, save_figure
-from kiras_rl.tools.rendering import RenderError, make_renderer
+from kiras_rl.tools.driving.rendering import RenderError, make_renderer
+from kiras_rl.tools.shared.arguments import PICTURES, file_of
+from kiras_rl.tools.shared.console import make_console
+from kiras_rl.tools.shared.ending import finish
+from kiras_rl.tools.shared.outputs import check_output, save_figure
 
 WRITER = "kiras-keyframes"
 
@@ -43,7 +43,7 @@ def main(argv: list[str] | None = None) -> int:
         "--out", type=file_of(PICTURES), help="picture (default: runs/keyframes/ROBOT.png)"
     )
     arguments = parser.parse_args(argv)
-    return finish(lambda: _show(arguments.robot, arguments.out), (RobotError,))
+    return finish(lambda: _show(arguments.robot, arguments.out))
 
 
 def _show(name: str, out: Path | None) -> int:

@@ -8,18 +8,11 @@ from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 
-from kiras_rl.config import ConfigError
 from kiras_rl.deploy.policy import PolicyError
-from kiras_rl.robots.robot import RobotError
-from kiras_rl.tools import policy_files, replay, summary
-from kiras_rl.tools.arguments import PICTURES, file_of
-from kiras_rl.tools.console import make_console
-from kiras_rl.tools.driver import Driver
-from kiras_rl.tools.ending import finish
-from kiras_rl.tools.ground import FLAT, terrain_of
-from kiras_rl.tools.outputs import check_output, save_arrays
-from kiras_rl.tools.rendering import RenderError
-from kiras_rl.tools.script import (
+from kiras_rl.tools.driving import replay, summary
+from kiras_rl.tools.driving.driver import Driver
+from kiras_rl.tools.driving.ground import FLAT, terrain_of
+from kiras_rl.tools.driving.script import (
     Segment,
     Trace,
     default_script,
@@ -27,10 +20,15 @@ from kiras_rl.tools.script import (
     parse_script,
     record,
 )
-from kiras_rl.tools.viewer import DEFAULT_PORT, LOOPBACK, LiveError
-from kiras_rl.tools.viewer.choices import title_of
-from kiras_rl.tools.viewer.cockpit import Cockpit
-from kiras_rl.tools.viewer.playback import Playback
+from kiras_rl.tools.driving.viewer import DEFAULT_PORT, LOOPBACK
+from kiras_rl.tools.driving.viewer.choices import title_of
+from kiras_rl.tools.driving.viewer.cockpit import Cockpit
+from kiras_rl.tools.driving.viewer.playback import Playback
+from kiras_rl.tools.shared import policy_files
+from kiras_rl.tools.shared.arguments import PICTURES, file_of
+from kiras_rl.tools.shared.console import make_console
+from kiras_rl.tools.shared.ending import finish
+from kiras_rl.tools.shared.outputs import check_output, save_arrays
 
 _DESCRIPTION = """\
 Drive one simulated robot with a trained policy, through the same code that runs on a real robot, on
@@ -95,7 +93,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         with suppress(KeyboardInterrupt):  # Ctrl-C is how a drive ends
             _drive(options) if _is_live(options) else _play(options)
 
-    return finish(work, (ConfigError, LiveError, PolicyError, RenderError, RobotError))
+    return finish(work)
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -161,7 +159,7 @@ def _is_live(options: argparse.Namespace) -> bool:
 
 def _drive(options: argparse.Namespace) -> None:
     """Let a person drive, or take a picture of what they would see."""
-    from kiras_rl.tools.viewer import live  # mujoco.studio: what a script does not need
+    from kiras_rl.tools.driving.viewer import live  # mujoco.studio: what a script does not need
 
     cockpit = _playback(options) if options.log else _cockpit(options)
     follow = options.policy if options.follow else None
@@ -175,7 +173,7 @@ def _drive(options: argparse.Namespace) -> None:
 
 
 def _cockpit(options: argparse.Namespace) -> Cockpit:
-    from kiras_rl.tools.viewer import live
+    from kiras_rl.tools.driving.viewer import live
 
     source = options.policy
     if options.follow:
@@ -221,14 +219,16 @@ def _save_trace(trace: Trace, driver: Driver, path: Path) -> None:
     if path.suffix == ".npz":
         save_arrays(trace.arrays(), path, TRACE)
     else:
-        from kiras_rl.tools.trace_figure import save_trace_figure  # matplotlib takes a second
+        from kiras_rl.tools.driving.trace_figure import (
+            save_trace_figure,  # matplotlib takes a second
+        )
 
         save_trace_figure(trace, driver.metadata, path)
     print(f"wrote {path}")
 
 
 def _save_pictures(trace: Trace, driver: Driver, options: argparse.Namespace) -> None:
-    from kiras_rl.tools.film import save_strips, save_video
+    from kiras_rl.tools.driving.film import save_strips, save_video
 
     tallest = max(posture.base_height for posture in driver.metadata.keyframes.values())
     for path, save in ((options.frames, save_strips), (options.video, save_video)):

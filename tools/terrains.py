@@ -19,14 +19,14 @@ from kiras_rl.config import ConfigError, load_config
 from kiras_rl.envs.model import build_scene
 from kiras_rl.envs.terrain_library import TerrainLibrary, build_library
 from kiras_rl.phases import plan
-from kiras_rl.robots.robot import Robot, RobotError, load_robot
+from kiras_rl.robots.robot import Robot, load_robot
 from kiras_rl.schema import Config
-from kiras_rl.tools.arguments import PICTURES, file_of
-from kiras_rl.tools.console import make_console
-from kiras_rl.tools.ending import finish
-from kiras_rl.tools.outputs import check_output, save_figure
-from kiras_rl.tools.rendering import RenderError, make_renderer
-from kiras_rl.tools.terrain_budgets import measure_budgets
+from kiras_rl.tools.benchmarks.terrain_budgets import measure_budgets
+from kiras_rl.tools.driving.rendering import make_renderer
+from kiras_rl.tools.shared.arguments import PICTURES, file_of
+from kiras_rl.tools.shared.console import make_console
+from kiras_rl.tools.shared.ending import finish
+from kiras_rl.tools.shared.outputs import check_output, save_figure
 
 WRITER = "kiras-terrains"
 
@@ -53,7 +53,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--budgets", action="store_true", help="measure contacts on MuJoCo-Warp")
     parser.add_argument("overrides", nargs="*", metavar="key=value", help="of the configuration")
     arguments = parser.parse_intermixed_args(argv)  # options between overrides, too
-    return finish(lambda: _show(arguments), (ConfigError, RenderError, RobotError))
+    return finish(lambda: _show(arguments))
 
 
 def _show(arguments: argparse.Namespace) -> None:

@@ -13,14 +13,22 @@ from pathlib import Path
 from kiras_rl import distributed
 from kiras_rl.checkpoint import FLAT, FOLDER, LATEST, find_checkpoint
 from kiras_rl.config import ConfigError, list_configs, load_config
+from kiras_rl.deploy.errors import PlainError
 from kiras_rl.ownership import owning
 from kiras_rl.process import StopRequest
 from kiras_rl.runner import KirasRunner
-from kiras_rl.tools.arguments import at_least
-from kiras_rl.tools.ending import finish, is_out_of_memory
-from kiras_rl.tools.side_by_side import train_side_by_side
-from kiras_rl.tools.sweep import list_sweeps, load_sweep, train_sweep
-from kiras_rl.tools.training import MISTAKES, begin, console, message_of, resume, run_of, train_run
+from kiras_rl.tools.driving.side_by_side import train_side_by_side
+from kiras_rl.tools.shared.arguments import at_least
+from kiras_rl.tools.shared.ending import finish, is_out_of_memory
+from kiras_rl.tools.training.run import (
+    begin,
+    console,
+    message_of,
+    resume,
+    run_of,
+    train_run,
+)
+from kiras_rl.tools.training.sweep import list_sweeps, load_sweep, train_sweep
 
 DESCRIPTION = """\
 Train one policy for all skills of a robot.
@@ -72,7 +80,7 @@ def _run(args: argparse.Namespace) -> int:
         return 1
     except Exception as error:
         short = isinstance(error, OSError) or is_out_of_memory(error)
-        if not short and not isinstance(error, MISTAKES):
+        if not short and not isinstance(error, PlainError):
             raise
         # The others of a machine make the same, but for what their disk or memory refuses.
         if distributed.local_rank() == 0 or short:

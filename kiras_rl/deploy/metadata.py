@@ -8,6 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING, Any
 
+from kiras_rl.deploy.errors import PlainError
 from kiras_rl.deploy.terms import Reading, find_rebuild
 
 if TYPE_CHECKING:
@@ -19,7 +20,7 @@ FORMAT = 1
 METADATA_KEY = "kiras"  # the entry of the ONNX file's metadata that holds the JSON text
 
 
-class PolicyError(ValueError):
+class PolicyError(PlainError, ValueError):
     """A policy file, or a reading given to a policy, that cannot be used; the message says why."""
 
 

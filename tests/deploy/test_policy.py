@@ -192,7 +192,7 @@ for name in ("torch", "rsl_rl", "tensordict", "onnx"):
     sys.modules[name] = None  # importing it raises ImportError
 import numpy as np
 from kiras_rl.deploy.policy import OnboardPolicy
-from kiras_rl.tools.driver import Driver
+from kiras_rl.tools.driving.driver import Driver
 
 policy = OnboardPolicy(sys.argv[1])
 driver = Driver(policy)

@@ -8,7 +8,7 @@ import pytest
 
 from kiras_rl.config import load_config
 from kiras_rl.phases import FINETUNING, phase_of
-from kiras_rl.tools.ground import Terrain
+from kiras_rl.tools.driving.ground import Terrain
 
 
 @pytest.fixture(scope="session")

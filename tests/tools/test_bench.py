@@ -14,9 +14,8 @@ import torch
 
 from kiras_rl.config import load_config
 from kiras_rl.robots.robot import load_robot
-from kiras_rl.tools import timing
 from kiras_rl.tools.bench import main
-from kiras_rl.tools.benchmarks import scale
+from kiras_rl.tools.benchmarks import scale, timing
 from kiras_rl.tools.benchmarks.request import Request
 
 SMALL = (
@@ -216,7 +215,7 @@ def test_contacts_need_terrain(capsys):
 
 def test_options_need_a_policy_that_comes_with_the_robot(capsys, monkeypatch, tmp_path):
     bare = SimpleNamespace(folder=tmp_path)
-    monkeypatch.setattr("kiras_rl.tools.policy_files.load_robot", lambda name: bare)
+    monkeypatch.setattr("kiras_rl.tools.shared.policy_files.load_robot", lambda name: bare)
     assert main([*SMALL, "--parts=options", "--cfg=go1"]) == 2
     assert "no policy comes with go1" in capsys.readouterr().err
 

@@ -25,8 +25,12 @@ from kiras_rl.export import export_policy
 from kiras_rl.phases import FINETUNING, SKILL_LEARNING, phase_of
 from kiras_rl.robots.robot import load_robot
 from kiras_rl.tools.collect import main
-from kiras_rl.tools.collector import Plan, collect
-from kiras_rl.tools.evaluator import evaluation_physics, make_evaluation_env, onboard_policy
+from kiras_rl.tools.driving.collector import Plan, collect
+from kiras_rl.tools.evaluation.evaluator import (
+    evaluation_physics,
+    make_evaluation_env,
+    onboard_policy,
+)
 
 FORWARD = ((0.1, 0.5), (0.0, 0.0), (-0.2, 0.2))
 ROBOT = load_robot("solo8")

@@ -9,9 +9,9 @@ import sys
 import pytest
 from patience import patience
 
-from kiras_rl.tools.console import make_console
-from kiras_rl.tools.report.content import Column, Table
-from kiras_rl.tools.report.terminal import as_rich
+from kiras_rl.tools.evaluation.report.content import Column, Table
+from kiras_rl.tools.evaluation.report.terminal import as_rich
+from kiras_rl.tools.shared.console import make_console
 
 
 @pytest.mark.parametrize("text", ["M [v2]/[red]x", "[/]", "a:smile:b", "\\[bold]"])

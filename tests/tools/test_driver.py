@@ -11,15 +11,15 @@ import torch
 from kiras_rl.deploy.policy import OnboardPolicy, PolicyError
 from kiras_rl.export import export_policy
 from kiras_rl.robots.robot import RobotError
-from kiras_rl.tools.driver import Driver
-from kiras_rl.tools.outputs import save_arrays
-from kiras_rl.tools.script import (
+from kiras_rl.tools.driving.driver import Driver
+from kiras_rl.tools.driving.script import (
     Segment,
     default_script,
     parse_command,
     parse_script,
     record,
 )
+from kiras_rl.tools.shared.outputs import save_arrays
 
 HIGH = 1.0  # m: nothing touches the ground for some steps
 

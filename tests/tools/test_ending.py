@@ -10,8 +10,9 @@ import threading
 
 import pytest
 
+from kiras_rl.deploy.errors import PlainError
 from kiras_rl.process import ENDS, StopRequest
-from kiras_rl.tools.ending import finish
+from kiras_rl.tools.shared.ending import finish
 
 
 @pytest.fixture(autouse=True)
@@ -90,14 +91,14 @@ def test_a_closed_output_ends_other_work(monkeypatch, capsys):
         (MemoryError(), "error: not enough memory: MemoryError"),
         (RuntimeError("DefaultCPUAllocator: can't allocate memory: 9 bytes"), "error: not enough"),
         (OSError(28, "No space left on device"), "error: [Errno 28] No space left on device"),
-        (ValueError("two\nlines"), "error: two lines"),
+        (PlainError("two\nlines"), "error: two lines"),
     ],
 )
 def test_a_mistake_is_one_line(error, line, capsys):
     def work():
         raise error
 
-    assert finish(work, (ValueError,)) == 2
+    assert finish(work) == 2
     err = capsys.readouterr().err
     assert err.startswith(line) and err.count("\n") == 1
 
@@ -120,4 +121,4 @@ def test_a_fault_of_the_program_is_no_mistake_of_its_user():
         raise KeyError("x")
 
     with pytest.raises(KeyError):
-        finish(work, (ValueError,))
+        finish(work)

@@ -15,12 +15,12 @@ from kiras_rl.config import load_config
 from kiras_rl.envs.quadruped import QuadrupedEnv
 from kiras_rl.robots.robot import load_robot
 from kiras_rl.tools import compare, evaluate, train
-from kiras_rl.tools.curves import read_scalars
 from kiras_rl.tools.evaluate import main
-from kiras_rl.tools.evaluator import evaluation_physics
-from kiras_rl.tools.policy_files import shipped_policy
-from kiras_rl.tools.protocols import PROTOCOLS
-from kiras_rl.tools.protocols.subject import Options, Subject
+from kiras_rl.tools.evaluation.evaluator import evaluation_physics
+from kiras_rl.tools.evaluation.protocols import PROTOCOLS
+from kiras_rl.tools.evaluation.protocols.subject import Options, Subject
+from kiras_rl.tools.shared.policy_files import shipped_policy
+from kiras_rl.tools.training.curves import read_scalars
 
 SKILLS = ["walk", "crawl", "stilt", "pitch_up", "pitch_down"]
 FEW = ["--robots", "2", "--trials", "1", "--duration", "2"]
@@ -128,7 +128,7 @@ def test_a_policy_is_measured_by_its_own_keyframes(tmp_path, monkeypatch):
 
     command = ["--protocol", "flat", *FEW, "--nominal", "--out"]
     assert main([*command, str(tmp_path / "before")]) == 0
-    for module in ("kiras_rl.tools.policy_files", "kiras_rl.envs"):
+    for module in ("kiras_rl.tools.shared.policy_files", "kiras_rl.envs"):
         monkeypatch.setattr(f"{module}.load_robot", changed)
     assert main([*command, str(tmp_path / "after")]) == 0
     assert results(tmp_path / "after", "flat") == results(tmp_path / "before", "flat")
@@ -143,11 +143,11 @@ def test_a_result_holds_for_the_physics_that_it_was_measured_on(tmp_path, monkey
     assert standard not in (key(4, backend="warp"), key(5, nominal=True))
     slippery = load_config("solo8", ["env.randomization.friction=[0.1,0.2]"])
     with monkeypatch.context() as patch:
-        patch.setattr("kiras_rl.tools.evaluator.standard_config", lambda robot: slippery)
+        patch.setattr("kiras_rl.tools.evaluation.evaluator.standard_config", lambda robot: slippery)
         assert key(6) != standard
     robot = load_robot("solo8")
     weak = replace(robot, motor=replace(robot.motor, stall_torque=robot.motor.stall_torque / 2))
-    monkeypatch.setattr("kiras_rl.tools.policy_files.load_robot", lambda name: weak)
+    monkeypatch.setattr("kiras_rl.tools.shared.policy_files.load_robot", lambda name: weak)
     assert key(7) != standard
 
 
@@ -156,7 +156,9 @@ def test_a_robot_without_terrain_of_its_own_has_none_to_cross(
     protocol, tmp_path, capsys, monkeypatch
 ):
     flat = load_config("solo8", ["finetuning=null"])
-    monkeypatch.setattr("kiras_rl.tools.protocols.subject.standard_config", lambda robot: flat)
+    monkeypatch.setattr(
+        "kiras_rl.tools.evaluation.protocols.subject.standard_config", lambda robot: flat
+    )
     assert main(["--protocol", protocol, *FEW, "--out", str(tmp_path)]) == 2
     assert "the standard configuration of solo8 has no terrain" in capsys.readouterr().err
 

@@ -9,7 +9,7 @@ from kiras_rl.checkpoint import load_checkpoint, save_checkpoint
 from kiras_rl.config import load_config
 from kiras_rl.phases import FINETUNING
 from kiras_rl.tools.train import main
-from kiras_rl.tools.training import begin, resume
+from kiras_rl.tools.training.run import begin, resume
 
 TINY = [
     *("num_envs=4", "evaluation.interval=0", "iterations=7", "finetuning.iterations=1"),

@@ -14,11 +14,11 @@ from kiras_rl.deploy.policy import OnboardPolicy
 from kiras_rl.envs.ground import Ground
 from kiras_rl.envs.terrain_library import build_library
 from kiras_rl.robots.robot import load_robot
-from kiras_rl.tools.driver import Driver
-from kiras_rl.tools.ground import FLAT, Terrain, Tile, ground_height, terrain_of
-from kiras_rl.tools.policy_files import load_policy
-from kiras_rl.tools.script import Segment, record
-from kiras_rl.tools.summary import summarize
+from kiras_rl.tools.driving.driver import Driver
+from kiras_rl.tools.driving.ground import FLAT, Terrain, Tile, ground_height, terrain_of
+from kiras_rl.tools.driving.script import Segment, record
+from kiras_rl.tools.driving.summary import summarize
+from kiras_rl.tools.shared.policy_files import load_policy
 
 KINDS = (
     "flat", "slopes", "bars", "footholds", "stairs_up", "stairs_down",

@@ -4,7 +4,8 @@ import pytest
 
 from kiras_rl.robots.robot import load_robot
 from kiras_rl.robots.statics import examine_keyframe
-from kiras_rl.tools import keyframes, rendering, terrains
+from kiras_rl.tools import keyframes, terrains
+from kiras_rl.tools.driving import rendering
 
 
 @pytest.fixture(autouse=True)

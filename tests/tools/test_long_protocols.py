@@ -11,8 +11,8 @@ import pytest
 
 from kiras_rl.deploy.policy import OnboardPolicy
 from kiras_rl.tools.evaluate import main
-from kiras_rl.tools.protocols import robustness
-from kiras_rl.tools.protocols.subject import Subject
+from kiras_rl.tools.evaluation.protocols import robustness
+from kiras_rl.tools.evaluation.protocols.subject import Subject
 
 SKILLS = ["walk", "crawl", "stilt", "pitch_up", "pitch_down"]
 

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
+from kiras_rl.tools.evaluation.report.files import PAGE, check_page
 from kiras_rl.tools.export import main as export
-from kiras_rl.tools.outputs import OutputError, check_output, save_arrays, save_figure
 from kiras_rl.tools.play import main as play
-from kiras_rl.tools.report.files import PAGE, check_page
+from kiras_rl.tools.shared.outputs import OutputError, check_output, save_arrays, save_figure
 
 
 @pytest.mark.parametrize("name", ["a.png", "a.jpg", "a.pdf", "a.svg"])

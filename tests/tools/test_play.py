@@ -15,8 +15,9 @@ import pytest
 from patience import patience
 
 from kiras_rl.robots.robot import load_robot
-from kiras_rl.tools import policy_files, rendering
+from kiras_rl.tools.driving import rendering
 from kiras_rl.tools.play import main
+from kiras_rl.tools.shared import policy_files
 
 SHORT = "--script=walk:0.4:0.3,crawl:0.4:0.3"
 

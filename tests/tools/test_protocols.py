@@ -9,9 +9,9 @@ import pytest
 
 from kiras_rl.config import ConfigError
 from kiras_rl.tools.evaluate import chosen
-from kiras_rl.tools.protocols import learning, sampling, transitions
-from kiras_rl.tools.protocols.crossing import percent, pooled, wilson
-from kiras_rl.tools.protocols.pooling import pool
+from kiras_rl.tools.evaluation.protocols import learning, sampling, transitions
+from kiras_rl.tools.evaluation.protocols.crossing import percent, pooled, wilson
+from kiras_rl.tools.evaluation.protocols.pooling import pool
 
 
 @pytest.mark.parametrize(

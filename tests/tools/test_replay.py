@@ -8,13 +8,13 @@ import pytest
 from kiras_rl.deploy.policy import OnboardPolicy, PolicyError
 from kiras_rl.deploy.runtime.blackbox import ROW, save
 from kiras_rl.deploy.runtime.messages import NANO, Mode, State
+from kiras_rl.tools.driving.replay import Replay, load_log, policy_of
+from kiras_rl.tools.driving.viewer import bindings
+from kiras_rl.tools.driving.viewer.playback import Playback
+from kiras_rl.tools.driving.viewer.stage import Stage
+from kiras_rl.tools.driving.viewer.terminal import lines
+from kiras_rl.tools.driving.viewer.view import View
 from kiras_rl.tools.play import main
-from kiras_rl.tools.replay import Replay, load_log, policy_of
-from kiras_rl.tools.viewer import bindings
-from kiras_rl.tools.viewer.playback import Playback
-from kiras_rl.tools.viewer.stage import Stage
-from kiras_rl.tools.viewer.terminal import lines
-from kiras_rl.tools.viewer.view import View
 
 SECONDS, RATE = 0.5, 1000
 TURN, NOD = 0.3, 0.1  # rad: yaw and pitch of the base, all the time

@@ -11,10 +11,10 @@ from matplotlib.figure import Figure as Drawing
 from rich.console import Console
 
 from kiras_rl.config import ConfigError
-from kiras_rl.tools.report.content import Column, Figure, Section, Table
-from kiras_rl.tools.report.files import as_csv, write_report
-from kiras_rl.tools.report.ledger import Ledger
-from kiras_rl.tools.report.terminal import as_rich
+from kiras_rl.tools.evaluation.report.content import Column, Figure, Section, Table
+from kiras_rl.tools.evaluation.report.files import as_csv, write_report
+from kiras_rl.tools.evaluation.report.ledger import Ledger
+from kiras_rl.tools.evaluation.report.terminal import as_rich
 
 TABLE = Table(
     "Errors <of> skills",

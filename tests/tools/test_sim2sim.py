@@ -12,10 +12,10 @@ import pytest
 
 from kiras_rl.robots.robot import load_robot
 from kiras_rl.robots.statics import examine_keyframe
-from kiras_rl.tools import sim2sim
 from kiras_rl.tools.evaluate import main
-from kiras_rl.tools.policy_files import load_policy
-from kiras_rl.tools.sim2sim import Record, Simulator, Start, motor_torque
+from kiras_rl.tools.evaluation import sim2sim
+from kiras_rl.tools.evaluation.sim2sim import Record, Simulator, Start, motor_torque
+from kiras_rl.tools.shared.policy_files import load_policy
 
 SKILLS = ["walk", "crawl", "stilt", "pitch_up", "pitch_down"]
 

@@ -7,7 +7,7 @@ import subprocess
 
 import pytest
 
-from kiras_rl.tools.source import source_commit
+from kiras_rl.tools.shared.source import source_commit
 
 COMMIT = "0123456789abcdef0123456789abcdef01234567"
 

@@ -8,9 +8,9 @@ import torch
 
 from kiras_rl.deploy.policy import OnboardPolicy
 from kiras_rl.evaluation import flat
-from kiras_rl.tools.driver import Driver
-from kiras_rl.tools.script import Segment, record
-from kiras_rl.tools.summary import (
+from kiras_rl.tools.driving.driver import Driver
+from kiras_rl.tools.driving.script import Segment, record
+from kiras_rl.tools.driving.summary import (
     AVERAGE,
     SETTLE,
     lifts_per_second,

@@ -15,11 +15,11 @@ from patience import patience
 
 from kiras_rl.checkpoint import load_checkpoint
 from kiras_rl.config import list_configs, load_config
-from kiras_rl.tools.progress import Progress
-from kiras_rl.tools.side_by_side import core_shares
-from kiras_rl.tools.sweep import list_sweeps, load_sweep
+from kiras_rl.tools.driving.side_by_side import core_shares
 from kiras_rl.tools.train import main
-from kiras_rl.tools.training import begin
+from kiras_rl.tools.training.progress import Progress
+from kiras_rl.tools.training.run import begin
+from kiras_rl.tools.training.sweep import list_sweeps, load_sweep
 
 TINY = ["num_envs=4", "iterations=2", "finetuning=null", "evaluation.interval=0"]
 NO_SIL = "{cfg: smoke, overrides: [learner.imitation=null]}"

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 
-from kiras_rl.tools import rendering, terrains
+from kiras_rl.tools import terrains
+from kiras_rl.tools.driving import rendering
 
 SMALL = ["finetuning.env.terrain.levels=2", "finetuning.env.terrain.variants=2"]
 

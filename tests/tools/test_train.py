@@ -17,9 +17,9 @@ from patience import patience
 from kiras_rl.checkpoint import find_checkpoint, load_checkpoint, load_policy, save_checkpoint
 from kiras_rl.config import load_config
 from kiras_rl.deploy.policy import OnboardPolicy
-from kiras_rl.tools.curves import read_scalars
-from kiras_rl.tools.progress import Progress
 from kiras_rl.tools.train import claim, main
+from kiras_rl.tools.training.curves import read_scalars
+from kiras_rl.tools.training.progress import Progress
 
 
 def only_run(runs, cfg):

@@ -25,9 +25,9 @@ from kiras_rl.process import single_threaded
 from kiras_rl.schema import LearnerConfig
 from kiras_rl.tools.benchmarks.request import Figures, Request, native
 from kiras_rl.tools.benchmarks.tables import make_table, verdict, with_range
+from kiras_rl.tools.benchmarks.timing import child, interleave, summarise
 from kiras_rl.tools.benchmarks.training import Training
 from kiras_rl.tools.benchmarks.workload import bare_steps
-from kiras_rl.tools.timing import child, interleave, summarise
 
 ITERATION, PHYSICS = "iteration", "bare physics"
 TARGET = 0.85  # of the bound's speed

@@ -23,7 +23,7 @@ from kiras_rl.phases import FINETUNING, finetuning_terrain, phase_of
 from kiras_rl.robots.robot import Robot, load_robot
 from kiras_rl.tools.benchmarks.request import Figures, Request
 from kiras_rl.tools.benchmarks.tables import make_table
-from kiras_rl.tools.timing import interleave, ratios, summarise
+from kiras_rl.tools.benchmarks.timing import interleave, ratios, summarise
 
 POSES = 400
 JOINT_NOISE = 0.3  # rad, 1 sigma

@@ -16,7 +16,7 @@ from kiras_rl.runner import KirasRunner
 from kiras_rl.schema import Config
 from kiras_rl.tools.benchmarks.request import Figures, Request, native
 from kiras_rl.tools.benchmarks.tables import make_table
-from kiras_rl.tools.policy_files import export_checkpoint, find_checkpoint
+from kiras_rl.tools.shared.policy_files import export_checkpoint, find_checkpoint
 
 STEPS = 2000  # a round
 

@@ -14,9 +14,9 @@ from kiras_rl.phases import Phase, plan
 from kiras_rl.recorded import WARM_UP
 from kiras_rl.tools.benchmarks.request import Figures, Request
 from kiras_rl.tools.benchmarks.tables import make_table
+from kiras_rl.tools.benchmarks.timing import PartTimer, Times
 from kiras_rl.tools.benchmarks.training import Training
 from kiras_rl.tools.benchmarks.workload import ENVIRONMENT_PARTS
-from kiras_rl.tools.timing import PartTimer, Times
 
 if TYPE_CHECKING:
     from matplotlib.typing import ColorType

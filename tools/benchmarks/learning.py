@@ -27,8 +27,15 @@ from kiras_rl.runner import KirasRunner
 from kiras_rl.schema import Config, LearnerConfig
 from kiras_rl.tools.benchmarks.request import Figures, Request
 from kiras_rl.tools.benchmarks.tables import make_table, verdict, with_range
+from kiras_rl.tools.benchmarks.timing import (
+    PartTimer,
+    Times,
+    interleave,
+    ratios,
+    summarise,
+    wait_for,
+)
 from kiras_rl.tools.benchmarks.training import ungated
-from kiras_rl.tools.timing import PartTimer, Times, interleave, ratios, summarise, wait_for
 
 Runner = TypeVar("Runner", bound=OnPolicyRunner)
 

@@ -29,15 +29,15 @@ from kiras_rl.robots.robot import Robot, load_robot
 from kiras_rl.schema import Config
 from kiras_rl.tools.benchmarks.request import Figures, Request, native
 from kiras_rl.tools.benchmarks.tables import make_table
+from kiras_rl.tools.benchmarks.timing import interleave, ratios, summarise
 from kiras_rl.tools.benchmarks.workload import timed_steps
-from kiras_rl.tools.evaluator import (
+from kiras_rl.tools.evaluation.evaluator import (
     evaluation_physics,
     make_evaluation_env,
     onboard_policy,
     trained_config,
 )
-from kiras_rl.tools.policy_files import load_policy
-from kiras_rl.tools.timing import interleave, ratios, summarise
+from kiras_rl.tools.shared.policy_files import load_policy
 
 CHOICE, REFERENCE = "configuration", "reference"
 SETTLE = 2.0  # s of walking before the states are taken

@@ -20,8 +20,8 @@ from kiras_rl.envs import make_env
 from kiras_rl.process import single_threaded
 from kiras_rl.tools.benchmarks.request import Figures, Request
 from kiras_rl.tools.benchmarks.tables import make_table, with_range
+from kiras_rl.tools.benchmarks.timing import interleave, ratios, summarise
 from kiras_rl.tools.benchmarks.workload import timed_steps
-from kiras_rl.tools.timing import interleave, ratios, summarise
 
 OURS, PEER = "KiRAS-RL", "mjlab"
 STEPS = 50  # control steps of a round

@@ -11,8 +11,8 @@ from kiras_rl.envs import make_env, resolve_backend
 from kiras_rl.process import single_threaded
 from kiras_rl.tools.benchmarks.request import Figures, Request
 from kiras_rl.tools.benchmarks.tables import make_table, verdict, with_range
+from kiras_rl.tools.benchmarks.timing import PartTimer, Times, interleave, ratios, summarise
 from kiras_rl.tools.benchmarks.workload import ENVIRONMENT_PARTS, Workload
-from kiras_rl.tools.timing import PartTimer, Times, interleave, ratios, summarise
 
 BARE = {"native": "mujoco.batch", "warp": "mujoco_warp"}
 NO_SENSORS, SIMULATION, ENVIRONMENT = "without sensors", "simulation step", "environment step"

@@ -11,8 +11,8 @@ from kiras_rl.process import single_threaded
 from kiras_rl.tools.benchmarks.physics import ENVIRONMENT
 from kiras_rl.tools.benchmarks.request import Figures, Request, native
 from kiras_rl.tools.benchmarks.tables import make_table, verdict, with_range
+from kiras_rl.tools.benchmarks.timing import interleave, ratios, summarise
 from kiras_rl.tools.benchmarks.workload import Workload
-from kiras_rl.tools.timing import interleave, ratios, summarise
 
 BARE_TERRAIN, TERRAIN = "mujoco.batch on terrain", "environment step on terrain"
 SPEED_TARGET = 0.75  # of bare mujoco.batch on the same terrain

@@ -13,8 +13,8 @@ from kiras_rl.phases import Phase
 from kiras_rl.process import single_threaded
 from kiras_rl.runner import KirasRunner
 from kiras_rl.schema import LearnerConfig
+from kiras_rl.tools.benchmarks.timing import wait_for
 from kiras_rl.tools.benchmarks.workload import Workload
-from kiras_rl.tools.timing import wait_for
 
 _UNGATED = {"gate_update": "off", "both": "bootstrap_input"}
 """AdaBoot modes -> the same without withheld updates: what is measured is a full iteration."""

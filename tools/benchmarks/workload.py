@@ -15,7 +15,7 @@ from kiras_rl.envs.quadruped import QuadrupedEnv
 from kiras_rl.envs.simulation.base import RANDOMISED_FIELDS
 from kiras_rl.envs.simulation.native import NativeSimulation
 from kiras_rl.schema import SimConfig
-from kiras_rl.tools.timing import wait_for
+from kiras_rl.tools.benchmarks.timing import wait_for
 
 ACTION_NOISE = 0.3  # as early in training, around the keyframe's pose: most robots stay up
 WARM_UP = 50  # control steps after the first reset, until the robots stand

@@ -12,17 +12,18 @@ from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
 
+from kiras_rl.deploy.errors import PlainError
 from kiras_rl.deploy.metadata import PolicyError, PolicyMetadata
 from kiras_rl.deploy.policy import OnboardPolicy
 from kiras_rl.deploy.runtime import preflight
 from kiras_rl.deploy.runtime.blackbox import Ring, save
-from kiras_rl.deploy.runtime.driver import Channel, LinkError, keep_pace
+from kiras_rl.deploy.runtime.driver import Channel, keep_pace
 from kiras_rl.deploy.runtime.hands import EMERGENCY, Gamepad, Hand, Keyboard, Remote
-from kiras_rl.deploy.runtime.mailbox import SHARED, BusyError
+from kiras_rl.deploy.runtime.mailbox import SHARED
 from kiras_rl.deploy.runtime.messages import NANO, Mode, Request, State
 from kiras_rl.deploy.runtime.processes import ROLES, Setup
 from kiras_rl.deploy.runtime.profiles import profile_of, source_of
-from kiras_rl.deploy.runtime.scripts import Script, ScriptError, parse_script
+from kiras_rl.deploy.runtime.scripts import Script, parse_script
 
 _DESCRIPTION = """\
 Run a policy file on a robot with a gamepad, a keyboard or the robot's own remote.
@@ -53,7 +54,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if kind == "check":
             return _check(path)
         return Session(kind, path, options).run()
-    except (BusyError, LinkError, PolicyError, ScriptError, OSError) as error:
+    except (PlainError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
     return 2
 

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from kiras_rl.deploy.errors import PlainError
 from kiras_rl.deploy.runtime.blackbox import Ring
 from kiras_rl.deploy.runtime.guard import Guard
 from kiras_rl.deploy.runtime.mailbox import SHARED, Mailbox, Seat
@@ -29,7 +30,7 @@ ALONE = 30.0  # s that a driver goes on damping after its runtime has ended
 SPIN = 0.0001  # s before a deadline that are waited for awake: the kernel wakes later than asked
 
 
-class LinkError(RuntimeError):
+class LinkError(PlainError, RuntimeError):
     """The robot cannot be reached, or is in a state in which it takes no orders."""
 
 

@@ -10,11 +10,13 @@ from pathlib import Path
 
 import numpy as np
 
+from kiras_rl.deploy.errors import PlainError
+
 SHARED = Path("/dev/shm")  # memory, whatever the name says
 TRIES = 3  # at a message that is being written
 
 
-class BusyError(RuntimeError):
+class BusyError(PlainError, RuntimeError):
     """Somebody else has the seat; the message says who."""
 
 

@@ -15,14 +15,14 @@ from pathlib import Path
 
 import numpy as np
 
-from kiras_rl.deploy.metadata import PolicyError
+from kiras_rl.deploy.errors import PlainError
 from kiras_rl.deploy.policy import OnboardPolicy
 from kiras_rl.deploy.profile import Profile
 from kiras_rl.deploy.runtime.blackbox import LENGTH, Ring
 from kiras_rl.deploy.runtime.driver import Channel, Driver, Link, LinkError, keep_pace
 from kiras_rl.deploy.runtime.go1 import Go1
 from kiras_rl.deploy.runtime.machine import Runtime
-from kiras_rl.deploy.runtime.mailbox import SHARED, BusyError
+from kiras_rl.deploy.runtime.mailbox import SHARED
 from kiras_rl.deploy.runtime.messages import NANO, State
 from kiras_rl.deploy.runtime.profiles import profile_of
 from kiras_rl.deploy.runtime.solo8 import Solo8, open_socket, read_calibration
@@ -166,7 +166,7 @@ def main(arguments: list[str] | None = None) -> int:
     setup = Setup(**json.loads(text))
     try:
         drive(setup) if role == "driver" else run(setup)
-    except (BusyError, LinkError, PolicyError, OSError) as error:
+    except (PlainError, OSError) as error:
         Log(setup.log, role)(f"error: {error}")
         return 2
     return 0

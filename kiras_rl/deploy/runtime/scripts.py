@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from kiras_rl.deploy.errors import PlainError
 from kiras_rl.deploy.metadata import PolicyMetadata
 from kiras_rl.deploy.runtime.hands import HELD, Hand
 from kiras_rl.deploy.runtime.messages import NANO, Request, State
@@ -18,7 +19,7 @@ _WORDS = {
 }
 
 
-class ScriptError(ValueError):
+class ScriptError(PlainError, ValueError):
     """A script that makes no sense; the message says why."""
 
 

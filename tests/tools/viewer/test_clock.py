@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from kiras_rl.tools.viewer.clock import Clock
+from kiras_rl.tools.driving.viewer.clock import Clock
 
 
 class World:

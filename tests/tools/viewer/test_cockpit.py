@@ -9,9 +9,9 @@ import torch
 from kiras_rl.config import config_to_dict, load_config
 from kiras_rl.deploy.policy import OnboardPolicy, PolicyError
 from kiras_rl.export import export_policy
-from kiras_rl.tools.ground import FLAT, Tile
-from kiras_rl.tools.viewer import bindings
-from kiras_rl.tools.viewer.cockpit import FALL_SECONDS, FORWARD, LEFT, SPEEDS, YAW, Cockpit
+from kiras_rl.tools.driving.ground import FLAT, Tile
+from kiras_rl.tools.driving.viewer import bindings
+from kiras_rl.tools.driving.viewer.cockpit import FALL_SECONDS, FORWARD, LEFT, SPEEDS, YAW, Cockpit
 
 DT = 0.02
 

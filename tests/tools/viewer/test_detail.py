@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from kiras_rl.tools.viewer.detail import LEVELS, Detail
+from kiras_rl.tools.driving.viewer.detail import LEVELS, Detail
 
 
 class Clock:

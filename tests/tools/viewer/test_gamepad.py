@@ -9,8 +9,8 @@ import struct
 import pytest
 
 from kiras_rl.deploy.policy import OnboardPolicy
-from kiras_rl.tools.viewer.cockpit import FORWARD, YAW, Cockpit
-from kiras_rl.tools.viewer.gamepad import Gamepad
+from kiras_rl.tools.driving.viewer.cockpit import FORWARD, YAW, Cockpit
+from kiras_rl.tools.driving.viewer.gamepad import Gamepad
 
 BUTTON, AXIS = 1, 2
 

@@ -9,9 +9,9 @@ import urllib.request
 import pytest
 
 from kiras_rl.deploy.policy import OnboardPolicy
-from kiras_rl.tools.viewer.cockpit import Cockpit
-from kiras_rl.tools.viewer.guard import is_allowed
-from kiras_rl.tools.viewer.live import open_page
+from kiras_rl.tools.driving.viewer.cockpit import Cockpit
+from kiras_rl.tools.driving.viewer.guard import is_allowed
+from kiras_rl.tools.driving.viewer.live import open_page
 
 
 @pytest.mark.parametrize(

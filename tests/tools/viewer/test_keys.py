@@ -5,9 +5,9 @@ from __future__ import annotations
 import pytest
 
 from kiras_rl.deploy.policy import OnboardPolicy
-from kiras_rl.tools.viewer.cockpit import FORWARD, YAW, Cockpit
-from kiras_rl.tools.viewer.keys import Keys
-from kiras_rl.tools.viewer.view import View
+from kiras_rl.tools.driving.viewer.cockpit import FORWARD, YAW, Cockpit
+from kiras_rl.tools.driving.viewer.keys import Keys
+from kiras_rl.tools.driving.viewer.view import View
 
 STEPS = 50  # a second
 

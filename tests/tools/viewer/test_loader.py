@@ -12,11 +12,11 @@ from patience import patience
 
 from kiras_rl.checkpoint import save_checkpoint
 from kiras_rl.deploy.policy import OnboardPolicy, PolicyError
-from kiras_rl.tools.viewer.choices import list_choices, newest_checkpoint, title_of
-from kiras_rl.tools.viewer.cockpit import Cockpit
-from kiras_rl.tools.viewer.loader import Follower, Loader
-from kiras_rl.tools.viewer.session import Session
-from kiras_rl.tools.viewer.view import View
+from kiras_rl.tools.driving.viewer.choices import list_choices, newest_checkpoint, title_of
+from kiras_rl.tools.driving.viewer.cockpit import Cockpit
+from kiras_rl.tools.driving.viewer.loader import Follower, Loader
+from kiras_rl.tools.driving.viewer.session import Session
+from kiras_rl.tools.driving.viewer.view import View
 
 
 @pytest.fixture
@@ -61,8 +61,10 @@ def test_robots_without_a_policy_are_not_offered(tmp_path, monkeypatch, still_fi
     for robot in ("bare", "able"):
         (tmp_path / robot / "policies").mkdir(parents=True)
     shutil.copy(still_file, tmp_path / "able/policies/still.onnx")
-    monkeypatch.setattr("kiras_rl.tools.viewer.choices.ROBOTS", tmp_path)
-    monkeypatch.setattr("kiras_rl.tools.viewer.choices.list_robots", lambda: ["able", "bare"])
+    monkeypatch.setattr("kiras_rl.tools.driving.viewer.choices.ROBOTS", tmp_path)
+    monkeypatch.setattr(
+        "kiras_rl.tools.driving.viewer.choices.list_robots", lambda: ["able", "bare"]
+    )
     assert [choice.title for choice in list_choices(tmp_path / "runs")] == ["able: still"]
 
 

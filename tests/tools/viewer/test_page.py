@@ -13,10 +13,10 @@ from patience import patience
 from PIL import Image
 from websockets.sync.client import connect
 
-from kiras_rl.tools.policy_files import load_policy
-from kiras_rl.tools.viewer import browser as browsers
-from kiras_rl.tools.viewer.cockpit import Cockpit
-from kiras_rl.tools.viewer.live import open_page
+from kiras_rl.tools.driving.viewer import browser as browsers
+from kiras_rl.tools.driving.viewer.cockpit import Cockpit
+from kiras_rl.tools.driving.viewer.live import open_page
+from kiras_rl.tools.shared.policy_files import load_policy
 
 pytestmark = pytest.mark.slow  # a browser that draws on the CPU takes all there is of it
 

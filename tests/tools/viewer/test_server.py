@@ -11,9 +11,9 @@ from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
 from kiras_rl.deploy.policy import OnboardPolicy
-from kiras_rl.tools.viewer.cockpit import YAW, Cockpit
-from kiras_rl.tools.viewer.live import open_page
-from kiras_rl.tools.viewer.server import CHANNEL
+from kiras_rl.tools.driving.viewer.cockpit import YAW, Cockpit
+from kiras_rl.tools.driving.viewer.live import open_page
+from kiras_rl.tools.driving.viewer.server import CHANNEL
 
 
 @pytest.fixture(scope="module")

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from kiras_rl.deploy.policy import OnboardPolicy
-from kiras_rl.tools.driver import Driver
-from kiras_rl.tools.viewer.stage import GHOST_GROUP, Stage, ghost_pose
+from kiras_rl.tools.driving.driver import Driver
+from kiras_rl.tools.driving.viewer.stage import GHOST_GROUP, Stage, ghost_pose
 
 
 def trajectory(policy_file, watched):

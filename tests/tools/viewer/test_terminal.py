@@ -14,10 +14,10 @@ import pytest
 from patience import patience
 
 from kiras_rl.deploy.policy import OnboardPolicy
-from kiras_rl.tools.ground import Tile
-from kiras_rl.tools.viewer.cockpit import FORWARD, Cockpit
-from kiras_rl.tools.viewer.terminal import lines
-from kiras_rl.tools.viewer.view import View
+from kiras_rl.tools.driving.ground import Tile
+from kiras_rl.tools.driving.viewer.cockpit import FORWARD, Cockpit
+from kiras_rl.tools.driving.viewer.terminal import lines
+from kiras_rl.tools.driving.viewer.view import View
 
 
 @pytest.fixture

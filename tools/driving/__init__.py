@@ -1,0 +1,1 @@
+"""Driving a policy on C MuJoCo: scripts, films, traces, the page in the browser."""

@@ -1,0 +1,1 @@
+"""Measuring policies: the protocols and their report."""

@@ -1,0 +1,1 @@
+"""What every command needs: arguments, console, outputs, policy files, how it ends."""

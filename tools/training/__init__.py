@@ -1,0 +1,1 @@
+"""Training from the command line: a run, its progress, its curves, sweeps."""
