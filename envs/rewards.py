@@ -87,6 +87,11 @@ def lin_vel_y_abs(step: Step) -> torch.Tensor:
     return step.robot.base_lin_vel_h[:, 1].abs()
 
 
+def lin_vel_z(step: Step) -> torch.Tensor:
+    """Return the squared vertical velocity, (m/s)^2."""
+    return step.robot.base_lin_vel_h[:, 2].square()
+
+
 def foot_slip(step: Step) -> torch.Tensor:
     """Return the sum of squared horizontal speeds of the standing feet, (m/s)^2."""
     speed = step.robot.foot_vel_w[..., :2].square().sum(-1)

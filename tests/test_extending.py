@@ -92,11 +92,11 @@ def test_a_skill_is_one_line():
 
 
 def test_a_reward_is_a_function_and_a_line():
-    env, _ = make_env("solo8_calm")
+    env, _ = make_env("solo8_thrifty")
     log = env.step(torch.randn(4, 8))[3]["log"]
-    v_z = env.measure().lin_vel_h[:, 2]
-    assert v_z.abs().max() > 0.01
-    torch.testing.assert_close(log["Reward/lin_vel_z"], -0.5 * v_z.square().mean())
+    power = (env.robot.joint_torque * env.robot.joint_vel).abs().sum(-1)
+    assert power.max() > 0.1  # W
+    torch.testing.assert_close(log["Reward/joint_power"], -0.005 * power.mean())
 
 
 def test_a_reward_may_remember_what_it_needs():

@@ -99,6 +99,7 @@ EXPECTED = {
     "ang_vel_z_abs": ({}, 0.5),
     "lin_vel_y": ({}, 0.01),
     "lin_vel_y_abs": ({}, 0.1),
+    "lin_vel_z": ({}, 0.05**2),
     "foot_slip": ({}, 0.09 + 0.16),  # the second foot is in the air
     "feet_air_time": ({"target": 0.1}, 0.02),  # the other foot is still in the air
     "short_swing": ({"least": 0.16}, 0.04 / 0.16),
