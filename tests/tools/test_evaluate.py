@@ -45,8 +45,8 @@ def test_the_imitation_protocol_measures_the_shipped_policy(tmp_path, capsys):
         assert 0.05 < result["dtw_frame"] < 0.6  # it moves its legs around the keyframe
         assert result["accuracy"] > 0.95 and result["cosine"] > 0.95
         assert result["height_error"] < 0.02
-        assert 3.0 < result["frequency"] < 8.0
-        assert 0.002 < result["clearance"] < 0.05
+        assert 1.5 < result["frequency"] < 4.0
+        assert 0.02 < result["clearance"] < 0.12
         assert 1.0 < result["power"] < 15.0
 
 
@@ -117,7 +117,7 @@ def test_transitions_are_measured_on_both_grounds(tmp_path, monkeypatch):
     assert {level for _, level, _ in tiles} == {3}
     assert {variant for _, _, variant in tiles} == {0, 1, 2}
     assert trace["height"]["mean"][70] == pytest.approx(0.2, abs=0.02)  # of walking, at 1.4 s
-    assert trace["height"]["mean"][145] == pytest.approx(0.1, abs=0.02)  # of crawling
+    assert trace["height"]["mean"][145] == pytest.approx(0.12, abs=0.02)  # of crawling
 
 
 def test_a_policy_is_measured_by_its_own_keyframes(tmp_path, monkeypatch):
@@ -169,11 +169,11 @@ def test_what_counts_as_a_fall_is_the_robot_s_standard():
     assert evaluation_physics(trained, False).env.terminations == standard.env.terminations
 
 
-def test_files_of_one_name_are_compared(tmp_path, monkeypatch):
+def test_files_of_one_name_are_compared(tmp_path, monkeypatch, smoke_run):
     monkeypatch.chdir(tmp_path)
-    for name, policy in (("a", "flat"), ("b", "rough")):
+    for name, policy in (("a", shipped_policy("solo8")), ("b", smoke_run / "policy.onnx")):
         (tmp_path / name).mkdir()
-        shutil.copy(shipped_policy("solo8").with_name(f"{policy}.onnx"), f"{name}/policy.onnx")
+        shutil.copy(policy, f"{name}/policy.onnx")
     command = ["old=a/policy.onnx", "new=b/policy.onnx", "--protocol", "flat", *FEW]
     assert compare.main(command) == 0
     folders = sorted(path.name for path in (tmp_path / "evaluation").iterdir())

@@ -8,14 +8,16 @@ import json
 
 import mujoco
 import numpy as np
+import onnx
 import pytest
 
+from kiras_rl.deploy.metadata import METADATA_KEY
 from kiras_rl.robots.robot import load_robot
 from kiras_rl.robots.statics import examine_keyframe
 from kiras_rl.tools.evaluate import main
 from kiras_rl.tools.evaluation import sim2sim
 from kiras_rl.tools.evaluation.sim2sim import Record, Simulator, Start, motor_torque
-from kiras_rl.tools.shared.policy_files import load_policy
+from kiras_rl.tools.shared.policy_files import load_policy, shipped_policy
 
 SKILLS = ["walk", "crawl", "stilt", "pitch_up", "pitch_down"]
 
@@ -201,5 +203,18 @@ def test_the_protocol_measures_the_shipped_policy(tmp_path, capsys, monkeypatch)
     assert [row[:2] for row in rows] == [[s, p] for s in SKILLS for p in ("training", "second")]
     for training, second in zip(rows[::2], rows[1::2], strict=True):
         assert float(second[4]) == pytest.approx(float(training[4]), abs=0.2)  # v_x, m/s
+    page = html.unescape((tmp_path / "report.html").read_text())
+    assert "the policy file's" in page
+
+
+def test_an_older_policy_file_is_measured_by_the_limits_of_robot_yaml(tmp_path, monkeypatch):
+    old = onnx.load(shipped_policy("solo8"))
+    (entry,) = (prop for prop in old.metadata_props if prop.key == METADATA_KEY)
+    entry.value = json.dumps(json.loads(entry.value) | {"joint_limits": None})
+    onnx.save(old, tmp_path / "old.onnx")
+    monkeypatch.setattr(sim2sim, "DURATION", 2.5)
+    monkeypatch.setattr(sim2sim, "STANDING", 0.1)
+    command = [str(tmp_path / "old.onnx"), "--protocol", "sim2sim", "--trials", "1"]
+    assert main([*command, "--out", str(tmp_path)]) == 0
     page = html.unescape((tmp_path / "report.html").read_text())
     assert "robot.yaml's, because the policy file has none" in page
