@@ -18,6 +18,7 @@ TINY = (
 
 SMALL = {
     "dreamwaq": (),
+    "cat": (),
     "cassi": ("learner.parts.cassi.batch_size=64", "learner.parts.cassi.updates=2"),
 }
 
