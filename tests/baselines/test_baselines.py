@@ -15,9 +15,9 @@ from kiras_rl.export import MAX_BYTES, export_policy
 from kiras_rl.phases import FINETUNING
 from kiras_rl.tools.train import main
 
-BASELINES = ("dreamwaq", "cassi", "cat")
+BASELINES = ("dreamwaq", "cassi", "cat", "wtw")
 
-SMALL = {"dreamwaq": {}, "cat": {}, "cassi": {"parts": {"cassi": {"batch_size": 64}}}}
+SMALL = {"dreamwaq": {}, "cat": {}, "wtw": {}, "cassi": {"parts": {"cassi": {"batch_size": 64}}}}
 """Changes of the learner that make the smallest training smaller."""
 
 MAY_DIFFER = (
@@ -48,6 +48,12 @@ BOUNDED = (
 )
 """Rewards whose place constraints take, on flat ground."""
 
+SCHEDULED = (
+    *("contact_force", "contact_velocity", "swing_height", "body_height", "body_orientation"),
+    *("short_swing", "short_stance", "low_swing", "idle_feet", "flight"),
+)
+"""Rewards of the gait that a clock sets, and those whose place they take."""
+
 OWN = {
     "dreamwaq": (),
     "cassi": UNLABELLED,
@@ -55,6 +61,14 @@ OWN = {
         "env.constraints",
         *(f"env.rewards.terms.{name}" for name in BOUNDED),
         *(f"finetuning.env.rewards.terms.{name}" for name in ("torque_limits", "limb_load")),
+    ),
+    "wtw": (
+        "env.commands.terms",
+        *(f"env.observations.proprio.{name}" for name in ("clock_signal", "behaviour")),
+        *(f"env.observations.critic.{name}" for name in ("friction", "payload")),
+        "env.rewards.sigma",
+        *(f"env.rewards.terms.{name}" for name in SCHEDULED),
+        *(f"finetuning.env.rewards.terms.skill_{name}" for name in ("height", "orientation")),
     ),
 }
 """What else differs, by baseline."""
