@@ -73,6 +73,12 @@ def clock(asking: Asking, frequency: tuple[float, float]) -> torch.Tensor:
     return torch.where(asking.renewed[:, None], drawn, later)
 
 
+@commanding(width=1, numbers=1)
+def number(asking: Asking, limits: tuple[float, float]) -> torch.Tensor:
+    """Ask for a number within limits, (N, 1), which stays until commands are drawn anew."""
+    return torch.where(asking.renewed[:, None], asking.between(limits), asking.before)
+
+
 def find_commands(terms: Mapping[str, Any]) -> dict[str, partial[Any]]:
     """Return the commands of a configuration by name.
 

@@ -11,6 +11,8 @@ from typing import Any
 import torch
 
 from kiras_rl.envs.lookup import find_terms
+from kiras_rl.envs.memory import remembering
+from kiras_rl.envs.rewards import air_time
 from kiras_rl.envs.shapes import evaluate
 from kiras_rl.envs.state import Step
 
@@ -30,6 +32,42 @@ def joint_speed(step: Step, most: float) -> torch.Tensor:
 def foot_force(step: Step, most: float) -> torch.Tensor:
     """Return the largest force on a foot beyond `most` body weights, body weights."""
     return (step.robot.foot_force.amax(dim=-1) / step.weight - most).clamp(min=0.0)
+
+
+def joint_acceleration(step: Step, most: float) -> torch.Tensor:
+    """Return the largest mean joint acceleration beyond `most` rad/s^2, rad/s^2."""
+    rate = (step.robot.joint_vel - step.last_joint_vel).abs() / step.dt
+    return (rate.amax(dim=-1) - most).clamp(min=0.0)
+
+
+def action_rate(step: Step, most: float) -> torch.Tensor:
+    """Return the fastest change of an action beyond `most` 1/s, 1/s."""
+    rate = (step.action - step.last_action).abs() / step.dt
+    return (rate.amax(dim=-1) - most).clamp(min=0.0)
+
+
+def limb_contact(step: Step, force: float) -> torch.Tensor:
+    """Return 1 where a thigh or shank presses with more than `force` N."""
+    return (step.robot.limb_force > force).any(dim=-1).float()
+
+
+@remembering(air_time)
+def short_swing(step: Step, least: float) -> torch.Tensor:
+    """Return by how much the shortest swing that ends now is below `least` s, s; 0 if standing."""
+    flown = step.memory[air_time]
+    lands = step.robot.foot_stands & (flown > 0.0)
+    lacking = torch.where(lands, (least - flown).clamp(min=0.0), 0.0)
+    return lacking.amax(dim=-1) * ~step.stands
+
+
+def idle_speed(step: Step, most: float) -> torch.Tensor:
+    """Return the largest joint velocity beyond `most` rad/s of a robot told to stand, rad/s."""
+    return joint_speed(step, most) * step.stands
+
+
+def standing_feet(step: Step, feet: float) -> torch.Tensor:
+    """Return by how many the feet on the ground differ from `feet` while it is told to move."""
+    return (step.robot.foot_stands.float().sum(dim=-1) - feet).abs() * ~step.stands
 
 
 class Constraints:

@@ -35,6 +35,8 @@ class View:
         keyframes: The skills.
         default_joint_pos: q0, (J,), rad.
         last_action: Clipped action of the last step, (N, J).
+        physics: Friction of the robots' geoms, and payload in kg, (N, 2); those of the MJCF where
+            neither is among the observations.
     """
 
     robot: RobotState
@@ -43,6 +45,7 @@ class View:
     keyframes: Keyframes
     default_joint_pos: torch.Tensor
     last_action: torch.Tensor
+    physics: torch.Tensor
 
 
 @observed(onboard=terms.projected_gravity)
@@ -117,6 +120,18 @@ def last_action(view: View) -> torch.Tensor:
     return view.last_action
 
 
+@observed()
+def friction(view: View) -> torch.Tensor:
+    """Return the coefficient of friction between robot and ground, 1."""
+    return view.physics[:, :1]
+
+
+@observed(unit="kg")
+def payload(view: View) -> torch.Tensor:
+    """Return the mass that is added to the base, 1, kg."""
+    return view.physics[:, 1:]
+
+
 @observed(unit="m")
 def foot_height(view: View) -> torch.Tensor:
     """Return the height of each foot's lowest point above the ground, F, m."""
@@ -148,6 +163,7 @@ class ObservationGroup:
         onboard: What rebuilds each term on a robot, as a policy file names it; None where the name
             of the term says it.
         noise: Half-width of the uniform noise of each number, after the scale, (size,).
+        tells_physics: Whether `friction` or `payload` is among the terms.
     """
 
     def __init__(self, name: str, entries: dict, view: View) -> None:
@@ -164,6 +180,7 @@ class ObservationGroup:
         self.onboard = [
             _twin(name, term.func) for name, term in zip(self.names, self._terms, strict=True)
         ]
+        self.tells_physics = any(term.func in (friction, payload) for term in self._terms)
         worlds = len(view.last_action)
         outputs = [
             evaluate(term, view, f"{where}.{name}", (worlds, None))

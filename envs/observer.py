@@ -43,6 +43,11 @@ class Observer:
         self._history = self._frame[:, None].repeat(1, config.history_length, 1)  # (N, H, P)
         self.observation = TensorDict()
 
+    @property
+    def tells_physics(self) -> bool:
+        """Whether a group tells what was randomized: what no term reads is not kept."""
+        return any(g.tells_physics for g in (self.proprio, self.critic, self.imitation))
+
     def observe(
         self, view: View, sensors: Sensors, begun: torch.Tensor, random: UniformBuffer
     ) -> TensorDict:

@@ -30,8 +30,19 @@ class Postures:
         ground: Ground | None,
         config: SkillConfig,
         widths: Mapping[str, int] | None = None,
+        physics: tuple[float, float] = (1.0, 0.0),
     ) -> None:
-        """Collect the constants of the robot; `widths` are those of the terms of commands."""
+        """Collect the constants of the robot.
+
+        Args:
+            robot: The robot.
+            keyframes: Its keyframes.
+            kinematics: Of its feet.
+            ground: Of the worlds; None where it is flat.
+            config: How episodes begin.
+            widths: Of the terms of commands.
+            physics: Friction and payload in kg of a robot that is not randomized.
+        """
         device = keyframes.height.device
 
         def tensor(values: object) -> torch.Tensor:
@@ -42,6 +53,7 @@ class Postures:
         self._limits = Limits.of(robot, device)
         self._keyframes, self._kinematics, self._ground = keyframes, kinematics, ground
         self._config, self._widths = config, widths or {}
+        self._physics = tensor(physics)
         self._geoms = len(robot.foot_geoms), len(robot.base_geoms), len(robot.penalised_geoms)
 
     def asked(self, action: torch.Tensor) -> torch.Tensor:
@@ -98,4 +110,5 @@ class Postures:
         robot = RobotState.at_rest(self._keyframes, skill, self._geoms)
         task = Task.of(command, skill, skill, Asked.nothing(self._widths, command))
         action = self.holding(robot.joint_pos)
-        return View(robot, robot, task, self._keyframes, self.default_joint_pos, action)
+        physics = self._physics.expand(len(skill), -1)
+        return View(robot, robot, task, self._keyframes, self.default_joint_pos, action, physics)

@@ -26,7 +26,12 @@ from kiras_rl.envs.model import build_scene
 from kiras_rl.envs.observations import View
 from kiras_rl.envs.observer import NOISE, Observer
 from kiras_rl.envs.postures import Postures
-from kiras_rl.envs.randomization import Randomizer, fields_of, find_randomizations
+from kiras_rl.envs.randomization import (
+    Randomizer,
+    fields_of,
+    find_randomizations,
+    nominal_physics,
+)
 from kiras_rl.envs.randomness import UniformBuffer, columns_of
 from kiras_rl.envs.rewards import RewardSum
 from kiras_rl.envs.sensing import Sensors
@@ -119,11 +124,19 @@ class QuadrupedEnv(SkillEnv):
         self._last_action = self._action.clone()
         self._last_joint_vel = torch.zeros(n, self.num_actions, device=device)
         self._last_joint_torque = torch.zeros(n, self.num_actions, device=device)
+        physics = nominal_physics(self.scene)
+        self._physics = torch.tensor([physics], device=device).repeat(n, 1)
         self._measurements: Measurements | None = None
         self._kinematics = FootKinematics(self.scene.model, robot, device)
         self.robot = RobotState(self.sim, self.scene.sensors, self._kinematics, self._ground)
         self._postures = Postures(
-            robot, self.keyframes, self._kinematics, self._ground, self.cfg.skills, widths
+            robot,
+            self.keyframes,
+            self._kinematics,
+            self._ground,
+            self.cfg.skills,
+            widths,
+            physics,
         )
 
     def _build_terms(self, seed: int) -> None:
@@ -273,7 +286,7 @@ class QuadrupedEnv(SkillEnv):
             self._curriculum.keep_counting(extras[names.EXTRA_VALID])
             self._curriculum.update(done, fallen, crossed, self.task.skill)
         self._begin_next(done)
-        return self._observe(done), terms.sum(dim=1), done, extras
+        return self._observe(done), self._rewards.total(terms), done, extras
 
     def _distance(self) -> torch.Tensor:
         """Return how far bases are from the middle of their tile, max(|x|, |y|), (N,), m."""
@@ -342,6 +355,8 @@ class QuadrupedEnv(SkillEnv):
     def _reset_worlds(self, mask: torch.Tensor, start: torch.Tensor) -> None:
         """Put the masked worlds into the keyframes `start`, (N,), with new physics and ground."""
         self._sensors.reset(mask, self._randomizer.reset(mask))
+        if self._observer.tells_physics:
+            self._physics = torch.where(mask[:, None], self._randomizer.physics, self._physics)
         if self._curriculum and self._ground:
             self._curriculum.begin(mask, self.task.skill)
             tile = self._curriculum.tiles() if self._placed is None else self._placed
@@ -361,7 +376,8 @@ class QuadrupedEnv(SkillEnv):
 
     def _view(self) -> View:
         q0 = self._postures.default_joint_pos
-        return View(self.robot, self.robot, self.task, self.keyframes, q0, self._action)
+        task, action = self.task, self._action
+        return View(self.robot, self.robot, task, self.keyframes, q0, action, self._physics)
 
     def _observe(self, begun: torch.Tensor) -> TensorDict:
         return self._observer.observe(self._view(), self._sensors, begun, self._random)
@@ -533,7 +549,7 @@ class QuadrupedEnv(SkillEnv):
 
 
 _EVENTS = ("Sim/overflowed", names.FALLS, names.TIME_OUTS, "Sim/diverged")
-_BUFFERS = ("_length", "_action", "_last_joint_vel", "_last_joint_torque")
+_BUFFERS = ("_length", "_action", "_last_joint_vel", "_last_joint_torque", "_physics")
 
 
 def _unless(mask: torch.Tensor, new: torch.Tensor, old: torch.Tensor) -> torch.Tensor:

@@ -169,6 +169,8 @@ class Randomizer:
         self._limits = nominal("actuator_forcerange")
         self._joints = {name: nominal(name) for name in ("dof_frictionloss", "dof_damping")}
         terms, self._step_dt = terms or {}, step_dt
+        self._foot, self._base = scene.robot_geoms[0], scene.base_body
+        self._mass = float(model.body_mass[scene.base_body])
         self._terms = {k: term for k, term in terms.items() if term.func.fields != (VELOCITY,)}
         self._kicks = {k: term for k, term in terms.items() if k not in self._terms}
         self._nominal = {name: nominal(name) for name in fields_of(terms.values(), model)}
@@ -202,6 +204,15 @@ class Randomizer:
             self._write_delay(mask, config.action_delay)
         self._write_terms(mask)
         return self._drawn
+
+    @property
+    def physics(self) -> torch.Tensor:
+        """Friction, and payload in kg, (N, 2), that the last `reset` drew for every world."""
+        friction = self._written.get("geom_friction", self._friction)[:, self._foot, :1]
+        if "body_mass" not in self._written:
+            return torch.cat([friction, torch.zeros_like(friction)], dim=1)
+        mass = self._written["body_mass"][:, self._base, None]
+        return torch.cat([friction, mass - self._mass], dim=1)
 
     def pushes(self, step_dt: float) -> tuple[torch.Tensor, torch.Tensor]:
         """Return which worlds are pushed now, (N,) bool, and the added velocity, (N, 2), m/s."""
@@ -289,6 +300,11 @@ class Randomizer:
         steps = torch.where(self._drawn, steps, 0.0)
         seconds = (steps - 0.5).clamp(min=0.0) * self._scene.model.opt.timestep
         self._write("actuator_delay", mask, seconds.expand_as(self._delay))
+
+
+def nominal_physics(scene: Scene) -> tuple[float, float]:
+    """Return friction and payload in kg of a robot as its MJCF has it; see `Randomizer.physics`."""
+    return float(scene.model.geom_friction[scene.robot_geoms[0], 0]), 0.0
 
 
 def draw_bodies(

@@ -279,7 +279,7 @@ def _landing(step: Step) -> torch.Tensor:
 
 
 class RewardSum:
-    """The weighted sum of the configured terms."""
+    """The weighted configured terms, and what they amount to."""
 
     def __init__(self, config: RewardConfig, step_dt: float, device: torch.device) -> None:
         """Look the terms up; `functions` are those without their parameters.
@@ -293,7 +293,7 @@ class RewardSum:
         self._terms = [_bind(name, values) for name, values in terms.items()]
         self.functions = [term.func for term in self._terms]
         self._scale = step_dt if config.scale_by_dt else 1.0
-        self._penalty_scale = config.penalty_scale
+        self._penalty_scale, self._sigma = config.penalty_scale, config.sigma
         self._schedules = [_schedule(values["weight"]) for values in terms.values()]
         self._whole = torch.tensor([bool(values.get("whole")) for values in terms.values()])
         self._weights = torch.empty(len(terms), device=device)
@@ -318,6 +318,17 @@ class RewardSum:
             for name, term in zip(self.names, self._terms, strict=True)
         ]
         return torch.stack(values, dim=1) * self._weights
+
+    def total(self, terms: torch.Tensor) -> torch.Tensor:
+        """Return the reward, (N,), of weighted terms (N, number of terms).
+
+        That is their sum, or with `sigma` the positive ones times exp(sum of the negative ones /
+        sigma), which is never negative: a penalty cannot make an early end pay.
+        """
+        if self._sigma is None:
+            return terms.sum(dim=1)
+        earned, paid = terms.clamp(min=0.0).sum(dim=1), terms.clamp(max=0.0).sum(dim=1)
+        return earned * torch.exp(paid / self._sigma)
 
 
 def _bind(name: str, values: dict) -> partial[torch.Tensor]:

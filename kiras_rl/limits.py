@@ -68,6 +68,7 @@ LIMITS = {
     "env.action_clip": Limits(0, 1000, above=True),
     "env.observations.history_length": Limits(0, 1000, above=True),
     "env.rewards.penalty_scale": _NOT_NEGATIVE,
+    "env.rewards.sigma": _POSITIVE,
     "env.commands.lin_vel_x": Limits(-20, 20),
     "env.commands.lin_vel_y": Limits(-20, 20),
     "env.commands.ang_vel_z": Limits(-20, 20),

@@ -37,11 +37,15 @@ class ObservationConfig:
 
 @dataclass
 class RewardConfig:
-    """Task reward: term name -> {weight, parameters of the term}; null removes a term."""
+    """Task reward: term name -> {weight, parameters of the term}; null removes a term.
+
+    It is their sum, or with `sigma` r+ exp(r- / sigma) of the positive and of the negative ones.
+    """
 
     scale_by_dt: bool
     penalty_scale: list[list[float]]
     terms: dict[str, Any]
+    sigma: float | None
 
 
 @dataclass

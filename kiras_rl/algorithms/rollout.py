@@ -18,6 +18,7 @@ OUTCOME = (
     names.EXTRA_IMITATION,
     names.EXTRA_VALID,
     names.EXTRA_FLAT,
+    names.EXTRA_CONSTRAINTS,
 )
 """What of `extras` is learned from."""
 

@@ -18,6 +18,8 @@ TINY = (
 
 SMALL = {
     "dreamwaq": (),
+    "cat": (),
+    "wtw": (),
     "cassi": ("learner.parts.cassi.batch_size=64", "learner.parts.cassi.updates=2"),
 }
 

@@ -64,3 +64,39 @@ def test_without_constraints_nothing_is_measured(build_env):
 def test_a_constraint_that_cannot_be_is_one_clear_line(build_env):
     with pytest.raises(ConfigError, match=r"no term 'joint_sped': did you mean 'joint_speed'\?"):
         build_env("env.constraints.joint_sped={most: 2.0}", num_envs=WORLDS)
+
+
+def test_those_of_the_gait_see_landings_and_who_is_told_to_stand(build_env):
+    env = build_env(
+        "env.constraints.joint_acceleration={most: 5.0}",
+        "env.constraints.action_rate={most: 10.0}",
+        "env.constraints.limb_contact={force: 0.5}",
+        "env.constraints.short_swing={least: 0.25}",
+        "env.constraints.idle_speed={most: 0.5}",
+        "env.constraints.standing_feet={feet: 2}",
+        num_envs=WORLDS,
+    )
+    command = torch.tensor([[0.0] * 3] * 2 + [[0.5, 0.0, 0.0]] * 2)
+    env.reset(torch.arange(WORLDS), command)
+    moving, dt = command[:, 0] > 0, env.step_dt
+    flown, met = torch.zeros(WORLDS, 4), torch.zeros(6, dtype=torch.bool)
+    for _ in range(25):
+        velocity, before = env.sim.qvel[:, 6:].clone(), env._action.clone()
+        actions = 2 * torch.randn(WORLDS, 8)
+        _, _, dones, extras = env.step(actions)
+        seen, stands = env.measure(), env.measure().foot_stands
+        swings = torch.where(stands & (flown > 0), 0.25 - flown, 0.0).clamp(min=0.0)
+        clip = env.cfg.action_clip
+        expected = [
+            (seen.joint_vel - velocity).abs().amax(1) / dt - 5.0,
+            (actions.clamp(-clip, clip) - before).abs().amax(1) / dt - 10.0,
+            (env.robot.limb_force > 0.5).any(1).float(),
+            swings.amax(1) * moving,
+            (seen.joint_vel.abs().amax(1) - 0.5) * ~moving,
+            (stands.sum(1) - 2).abs() * moving,
+        ]
+        found = extras[names.EXTRA_CONSTRAINTS]
+        torch.testing.assert_close(found, torch.stack(expected, dim=1).clamp(min=0.0))
+        met |= (found > 0).any(0)
+        flown = (flown + dt) * ~stands * ~dones[:, None]
+    assert met.all()

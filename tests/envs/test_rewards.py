@@ -82,7 +82,7 @@ def crafted(command=(0.5, 0.0, 0.2), fresh=False, fallen=False):
 
 def value(name, step, **parameters):
     """Return a term's value with weight 1."""
-    config = RewardConfig(False, CONSTANT, terms={name: {"weight": 1.0} | parameters})
+    config = RewardConfig(False, CONSTANT, {name: {"weight": 1.0} | parameters}, None)
     return RewardSum(config, step.dt, torch.device("cpu"))(step).item()
 
 
@@ -195,7 +195,7 @@ def test_a_fall_is_told():
 @pytest.mark.parametrize(("scale_by_dt", "factor"), [(False, 1.0), (True, 0.02)])
 def test_terms_are_weighed_and_scaled(scale_by_dt, factor):
     terms = {"torques": {"weight": -0.1}, "action_rate": None, "lin_vel_y_abs": {"weight": 3.0}}
-    total = RewardSum(RewardConfig(scale_by_dt, CONSTANT, terms), 0.02, torch.device("cpu"))
+    total = RewardSum(RewardConfig(scale_by_dt, CONSTANT, terms, None), 0.02, torch.device("cpu"))
     assert total.names == ["torques", "lin_vel_y_abs"]
     expected = torch.tensor([[-0.5, 0.3]]) * factor
     torch.testing.assert_close(total(crafted()), expected)
@@ -218,16 +218,18 @@ def test_errors_of_posture_within_the_slack_cost_nothing():
 
 def test_a_penalty_may_be_whole_from_the_start():
     terms = {"torques": {"weight": -0.1, "whole": True}, "action_rate": {"weight": -0.1}}
-    total = RewardSum(RewardConfig(False, [[0.0, 0.5], [1.0, 1.0]], terms), 0.02, "cpu")
+    total = RewardSum(RewardConfig(False, [[0.0, 0.5], [1.0, 1.0]], terms, None), 0.02, "cpu")
     total.set_progress(0.0)
     torch.testing.assert_close(total(crafted()), torch.tensor([[-0.5, -0.25]]))
     with pytest.raises(ConfigError, match=r"torques\.whole=2: must be true"):
-        RewardSum(RewardConfig(False, CONSTANT, {"torques": {"weight": 1, "whole": 2}}), 1, "cpu")
+        RewardSum(
+            RewardConfig(False, CONSTANT, {"torques": {"weight": 1, "whole": 2}}, None), 1, "cpu"
+        )
 
 
 def test_weights_and_penalties_follow_their_schedules():
     terms = {"torques": {"weight": [[0.0, -0.1], [0.5, -0.3]]}, "lin_vel_y_abs": {"weight": 3.0}}
-    config = RewardConfig(False, [[0.0, 0.5], [1.0, 1.0]], terms)
+    config = RewardConfig(False, [[0.0, 0.5], [1.0, 1.0]], terms, None)
     total = RewardSum(config, 0.02, torch.device("cpu"))
     for progress, weight in ((0.0, -0.1 * 0.5), (0.25, -0.2 * 0.625), (1.0, -0.3)):
         total.set_progress(progress)
@@ -246,5 +248,14 @@ def test_weights_and_penalties_follow_their_schedules():
 )
 def test_a_term_that_cannot_be_is_refused(terms, message):
     with pytest.raises(ConfigError) as caught:
-        RewardSum(RewardConfig(False, CONSTANT, terms), 0.02, torch.device("cpu"))
+        RewardSum(RewardConfig(False, CONSTANT, terms, None), 0.02, torch.device("cpu"))
     assert message in str(caught.value)
+
+
+def test_with_a_sigma_penalties_take_a_share_of_what_is_earned():
+    config = RewardConfig(False, CONSTANT, {"torques": {"weight": -1.0}}, None)
+    terms = torch.tensor([[2.0, 1.0, -1.0, -0.5], [0.0, 0.0, -3.0, 0.0]])
+    assert RewardSum(config, 1, "cpu").total(terms).tolist() == [1.5, -3.0]
+    config.sigma = 0.5
+    composed = RewardSum(config, 1, "cpu").total(terms)
+    torch.testing.assert_close(composed, torch.tensor([3.0, 0.0]) * math.exp(-1.5 / 0.5))
