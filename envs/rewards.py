@@ -134,14 +134,14 @@ def feet_air_time(step: Step, target: float) -> torch.Tensor:
 
     Short steps cost, long ones earn.
     """
-    return ((step.memory[air_time] - target) * _landing(step)).sum(-1) * ~step.stands
+    return ((step.memory[air_time] - target) * _landing(step)).sum(-1) * step.moves
 
 
 @remembering(air_time)
 def short_swing(step: Step, least: float) -> torch.Tensor:
     """Return the sum over feet that land of the share of `least` s that their swing lacks."""
     lacking = (1.0 - step.memory[air_time] / least).clamp(min=0.0)
-    return (lacking * _landing(step)).sum(-1) * ~step.stands
+    return (lacking * _landing(step)).sum(-1) * step.moves
 
 
 @remembering(stance_time)
@@ -149,7 +149,7 @@ def short_stance(step: Step, least: float) -> torch.Tensor:
     """Return the sum over feet that lift off of the share of `least` s that their stance lacks."""
     stood = step.memory[stance_time]
     lifting = ~step.robot.foot_stands & (stood > 0.0)
-    return ((1.0 - stood / least).clamp(min=0.0) * lifting).sum(-1) * ~step.stands
+    return ((1.0 - stood / least).clamp(min=0.0) * lifting).sum(-1) * step.moves
 
 
 @remembering(air_time, swing_peak)
@@ -162,7 +162,7 @@ def low_swing(step: Step, factor: float) -> torch.Tensor:
     """
     wanted = (factor * step.keyframes.clearance[step.task.skill])[:, None]
     lacking = (1.0 - step.memory[swing_peak] / wanted).clamp(min=0.0).square()
-    return (lacking * _landing(step)).sum(-1) * ~step.stands
+    return (lacking * _landing(step)).sum(-1) * step.moves
 
 
 @remembering(air_time, descent)
@@ -172,20 +172,20 @@ def hard_landing(step: Step, most: float) -> torch.Tensor:
     In (m/s)^2. A price from 0 m/s on would pay for low steps.
     """
     excess = (step.memory[descent] - most).clamp(min=0.0)
-    return (excess.square() * _landing(step)).sum(-1) * ~step.stands
+    return (excess.square() * _landing(step)).sum(-1) * step.moves
 
 
 @remembering(stance_time, air_time)
 def idle_feet(step: Step, most: float) -> torch.Tensor:
     """Return the number of feet that have neither lifted off nor landed for over `most` s."""
     idle = (step.memory[stance_time] > most) | (step.memory[air_time] > most)
-    return idle.float().sum(-1) * ~step.stands
+    return idle.float().sum(-1) * step.moves
 
 
 def flight(step: Step, feet: float) -> torch.Tensor:
     """Return how many feet fewer than `feet` are on the ground."""
     standing = step.robot.foot_stands.float().sum(-1)
-    return (feet - standing).clamp(min=0.0) * ~step.stands
+    return (feet - standing).clamp(min=0.0) * step.moves
 
 
 def joint_limits(step: Step, margin: float) -> torch.Tensor:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from types import SimpleNamespace
 
 import torch
@@ -390,6 +391,11 @@ class Step:
     fallen: torch.Tensor
     weight: float
     dt: float
+
+    @cached_property
+    def moves(self) -> torch.Tensor:
+        """Worlds that are told to move, (N,) bool; many terms ask."""
+        return ~self.stands
 
 
 def grid(rows: int, columns: int, spacing: float) -> torch.Tensor:

@@ -31,9 +31,10 @@ def copy_project(folder: Path) -> None:
         (folder / "kiras_rl" / name).symlink_to(folder / name)
 
 
-def forget_the_package() -> dict:
-    """Take kiras_rl out of the modules that Python has loaded, and return it."""
-    names = [name for name in sys.modules if name.split(".")[0] == "kiras_rl"]
+def forget_the_package(folder: Path) -> dict:
+    """Take kiras_rl and the user's files out of what Python has loaded, and return that."""
+    ours = {"kiras_rl", *(path.stem for path in folder.glob("*.py"))}
+    names = [name for name in sys.modules if name.split(".")[0] in ours]
     return {name: sys.modules.pop(name) for name in names}
 
 
@@ -44,12 +45,12 @@ def extended(tmp_path_factory):
     copy_project(folder)
     command = ["git", "apply"]
     subprocess.run(command, input="".join(DIFFS), cwd=folder, text=True, check=True)
-    original = forget_the_package()
+    original = forget_the_package(folder)
     sys.path.insert(0, str(folder))
     importlib.invalidate_caches()
     yield folder
     sys.path.remove(str(folder))
-    forget_the_package()
+    forget_the_package(folder)
     sys.modules.update(original)
 
 
