@@ -245,7 +245,7 @@ def test_every_term_of_an_observation_has_its_unit_or_none():
         for name, function in inspect.getmembers(observations, inspect.isfunction)
         if list(inspect.signature(function).parameters) == ["view"]
     }
-    without = {"projected_gravity", "skill", "last_action"}
+    without = {"projected_gravity", "skill", "last_action", "friction"}
     assert set(observations.UNITS) == terms - without
 
 
