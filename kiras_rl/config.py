@@ -17,7 +17,7 @@ from kiras_rl.deploy.errors import PlainError
 from kiras_rl.files import replacing
 from kiras_rl.limits import find_outside_fields
 from kiras_rl.ranges import find_mistake
-from kiras_rl.schema import Config
+from kiras_rl.schema import Config, TerrainConfig
 from kiras_rl.yaml_files import YamlError, read_yaml_file, read_yaml_text
 
 T = TypeVar("T")
@@ -88,9 +88,19 @@ def config_from_dict(values: dict, overrides: list[str] | tuple[str, ...] = ()) 
     source = "the saved configuration"
     saved = _merge(copy.deepcopy(_schema()), _moved(_without(values, OBSOLETE), MOVED), source)
     younger = OmegaConf.create()
-    for key in OmegaConf.missing_keys(saved):
+    for key in (*OmegaConf.missing_keys(saved), *_missing_terrain(saved)):
         OmegaConf.update(younger, key, OmegaConf.select(_base(), key))
     return _resolve([younger], list(overrides), source, begin=saved)
+
+
+def _missing_terrain(saved: DictConfig) -> list[str]:
+    """Return the keys that the terrain of finetuning leaves out, which only its phase types."""
+    where = "finetuning.env.terrain"
+    if (terrain := OmegaConf.select(saved, where)) is None:
+        return []
+    typed = OmegaConf.structured(TerrainConfig)
+    _check_keys(typed, terrain, "the saved configuration", f"{where}.")
+    return [f"{where}.{key}" for key in OmegaConf.missing_keys(OmegaConf.merge(typed, terrain))]
 
 
 def _without(values: dict, keys: Iterable[str]) -> dict:
