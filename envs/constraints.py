@@ -57,7 +57,7 @@ def short_swing(step: Step, least: float) -> torch.Tensor:
     flown = step.memory[air_time]
     lands = step.robot.foot_stands & (flown > 0.0)
     lacking = torch.where(lands, (least - flown).clamp(min=0.0), 0.0)
-    return lacking.amax(dim=-1) * ~step.stands
+    return lacking.amax(dim=-1) * step.moves
 
 
 def idle_speed(step: Step, most: float) -> torch.Tensor:
@@ -67,7 +67,7 @@ def idle_speed(step: Step, most: float) -> torch.Tensor:
 
 def standing_feet(step: Step, feet: float) -> torch.Tensor:
     """Return by how many the feet on the ground differ from `feet` while it is told to move."""
-    return (step.robot.foot_stands.float().sum(dim=-1) - feet).abs() * ~step.stands
+    return (step.robot.foot_stands.float().sum(dim=-1) - feet).abs() * step.moves
 
 
 class Constraints:

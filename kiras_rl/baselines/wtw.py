@@ -69,14 +69,14 @@ def contact_force(step: Any, scale: float) -> torch.Tensor:
     """
     force = (step.robot.foot_force / step.weight).square()
     swings = 1.0 - desired_contact(_turns(step))
-    return (swings * (1.0 - torch.exp(-force / scale))).mean(dim=-1) * ~step.stands
+    return (swings * (1.0 - torch.exp(-force / scale))).mean(dim=-1) * step.moves
 
 
 def contact_velocity(step: Any, scale: float) -> torch.Tensor:
     """Return the mean over feet of C (1 - exp(-v^2 / scale)), velocities in m/s."""
     speed = step.robot.foot_vel_w.square().sum(dim=-1)
     stance = desired_contact(_turns(step))
-    return (stance * (1.0 - torch.exp(-speed / scale))).mean(dim=-1) * ~step.stands
+    return (stance * (1.0 - torch.exp(-speed / scale))).mean(dim=-1) * step.moves
 
 
 def swing_height(step: Any) -> torch.Tensor:
@@ -84,7 +84,7 @@ def swing_height(step: Any) -> torch.Tensor:
     turns = _turns(step)
     error = swing_arc(turns) * step.task.terms["swing_height"] - step.robot.foot_height
     swings = 1.0 - desired_contact(turns)
-    return (swings * error.square()).sum(dim=-1) * ~step.stands
+    return (swings * error.square()).sum(dim=-1) * step.moves
 
 
 def body_height(step: Any) -> torch.Tensor:
