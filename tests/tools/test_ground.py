@@ -93,6 +93,13 @@ def test_a_run_that_cannot_be_read_still_drives(make_metadata):
     assert terrain_of(make_metadata(provenance=broken)).kinds == KINDS
 
 
+def test_a_run_with_types_of_an_earlier_version_drives_on_those_of_today(make_metadata):
+    config = config_to_dict(load_config("base"))
+    types = config["finetuning"]["env"]["terrain"]["types"]
+    types["stairs"] = types.pop("stairs_up")
+    assert terrain_of(make_metadata(provenance={"config": config})).kinds == KINDS
+
+
 def test_flat_ground_is_there_even_if_a_run_had_none(terrain):
     types = terrain.config.types | {"flat": None, "bars": None}
     other = Terrain(dataclasses.replace(terrain.config, types=types))

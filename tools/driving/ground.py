@@ -155,7 +155,10 @@ def _own_terrain(saved: object) -> TerrainConfig | None:
 @cache  # it takes half a second, and every checkpoint of a run that is followed asks for it
 def _read(saved: str) -> TerrainConfig | None:
     try:
-        return _terrain(config_from_dict(json.loads(saved)))
+        terrain = _terrain(config_from_dict(json.loads(saved)))
+        if terrain:  # its types may have other names by now: make the fewest tiles
+            build_library(replace(terrain, levels=2, variants=1))
+        return terrain
     except ConfigError:
         return None
 
