@@ -15,20 +15,112 @@ from kiras_rl.algorithms.part import Iteration, Outcome, Part, Setting
 from kiras_rl.algorithms.storage import GroupRolloutStorage, mini_batches
 from kiras_rl.algorithms.trainer import Trainer
 from kiras_rl.config import ConfigError
-from kiras_rl.models.estimator import VELOCITY_DIM, ContextEstimator, Estimator
+from kiras_rl.models.estimator import (
+    VELOCITY_DIM,
+    ContextEstimator,
+    Estimator,
+    VariationalEstimator,
+)
 from kiras_rl.schema import EstimatorConfig
 from kiras_rl.shards import Batch
 
 VELOCITY_SCALE = 2.0  # in the loss: velocity errors then weigh as much as observation errors
 
 
-class Estimation(Part):
-    """The estimator, its trainer and AdaBoot."""
+class Told(Part):
+    """An estimator and its trainer: the actor is told the context. A subclass has the loss."""
+
+    estimator: Estimator
+
+    def __init__(
+        self, estimator: Estimator, relative_step: float, epochs: int, device: str
+    ) -> None:
+        """Take the network.
+
+        Args:
+            estimator: The network.
+            relative_step: Adam's step size, of the actor's.
+            epochs: Passes over a rollout.
+            device: Of the network.
+        """
+        self.estimator = estimator.to(device)
+        self._relative_step, self._epochs = relative_step, epochs
+        self._data: dict[str, torch.Tensor] = {}
+        self._num_mini_batches = 1
+        self.trainer = Trainer(
+            self.estimator.parameters(),
+            self._loss,
+            0.0,  # set anew before every update
+            device,
+            self._batches,
+            variant=lambda: self._num_mini_batches,
+        )
+
+    def groups(self, obs: TensorDict) -> dict[str, torch.Tensor]:
+        """Return the context."""
+        return self.observe(obs)
+
+    def observe(self, obs: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+        """Return the context: an observation of the step as all others are."""
+        return {names.CONTEXT: self.context(obs)}
+
+    @torch.no_grad()
+    def context(self, obs: Mapping[str, torch.Tensor]) -> torch.Tensor:
+        """Return what the actor is told, (N, context_dim)."""
+        return self.estimator.context(self.estimator.frames(obs))
+
+    def train(
+        self, rollout: GroupRolloutStorage, iteration: Iteration, **data: torch.Tensor
+    ) -> list[float]:
+        """Train on frames and other data of a rollout; return the means of what the loss reports.
+
+        A step changes what the actor is told, and so its actions, past PPO's trust region. Its size
+        follows that of the actor's, which must be able to follow.
+        """
+        torch.mul(iteration.actor_rate, self._relative_step, out=self.trainer.rate)
+        frames = self.estimator.frames(rollout.observations)
+        rollout.shuffle_into(self._data, frames=frames, **data)
+        self._num_mini_batches = iteration.mini_batches
+        return self.trainer.train(self._epochs).tolist()
+
+    def _batches(self) -> Iterator[Batch]:
+        return iter(mini_batches(self._data, self._num_mini_batches))
+
+    def _loss(self, **batch: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return the loss of a batch, and what is reported of it."""
+        raise NotImplementedError
+
+    def networks(self) -> dict[str, nn.Module]:
+        """Return the estimator."""
+        return {"estimator": self.estimator}
+
+    def lasting(self) -> dict[str, nn.Module]:
+        """Return the estimator."""
+        return self.networks()
+
+    def onboard(self) -> Estimator:
+        """Return the estimator."""
+        return self.estimator
+
+    def state_dict(self) -> dict:
+        """Return network and optimizer."""
+        return {"estimator": self.estimator.state_dict(), "optimizer": self.trainer.state_dict()}
+
+    def load_state_dict(self, state: dict) -> None:
+        """Go on from a saved state."""
+        self.estimator.load_state_dict(state["estimator"])
+        self.trainer.load_state_dict(state["optimizer"])
+
+
+class Estimation(Told):
+    """A variational estimator, its trainer and AdaBoot."""
+
+    estimator: VariationalEstimator
 
     def __init__(
         self,
         config: EstimatorConfig,
-        estimator: Estimator,
+        estimator: VariationalEstimator,
         num_envs: int,
         device: str,
     ) -> None:
@@ -41,19 +133,8 @@ class Estimation(Part):
             raise ConfigError(
                 f"learner.estimator.adaboot={config.adaboot}: allowed are {', '.join(MODES)}"
             )
-        self.config = config
-        self.estimator = estimator.to(device)
-        self._device = device
-        self._data: dict[str, torch.Tensor] = {}
-        self._num_mini_batches = 1
-        self.trainer = Trainer(
-            self.estimator.parameters(),
-            self._loss,
-            0.0,  # set anew before every update
-            device,
-            self._batches,
-            variant=lambda: self._num_mini_batches,
-        )
+        super().__init__(estimator, config.relative_step, config.epochs, device)
+        self.config, self._device = config, device
         self.adaboot = AdaBoot(config.adaboot, config.adaboot_floor, num_envs, device)
 
     @classmethod
@@ -77,14 +158,7 @@ class Estimation(Part):
 
     def groups(self, obs: TensorDict) -> dict[str, torch.Tensor]:
         """Return the context, and the frame that is to be predicted."""
-        return {
-            names.CONTEXT: self.context(obs),
-            names.NEXT_PROPRIO: torch.zeros_like(obs[names.PROPRIO]),
-        }
-
-    def observe(self, obs: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
-        """Return the context: an observation of the step as all others are."""
-        return {names.CONTEXT: self.context(obs)}
+        return super().groups(obs) | {names.NEXT_PROPRIO: torch.zeros_like(obs[names.PROPRIO])}
 
     @torch.no_grad()
     def context(self, obs: Mapping[str, torch.Tensor]) -> torch.Tensor:
@@ -92,7 +166,7 @@ class Estimation(Part):
 
         With AdaBoot on the input, worlds that do not trust the estimate are told the true velocity.
         """
-        context = self.estimator.context(self.estimator.frames(obs))
+        context = super().context(obs)
         if self.adaboot.bootstraps_input:
             told = self.adaboot.uses_estimate[:, None]
             velocity = torch.where(told, context[:, :VELOCITY_DIM], obs[names.VELOCITY])
@@ -105,34 +179,27 @@ class Estimation(Part):
         return {names.NEXT_PROPRIO: step.extras[names.NEXT_PROPRIO]}
 
     def update(self, rollout: GroupRolloutStorage, iteration: Iteration) -> dict[str, float]:
-        """Train on the rollout unless AdaBoot withholds it; return scalars for the log.
-
-        A step changes what the actor is told, and so its actions, past PPO's trust region. Its size
-        follows that of the actor's, which must be able to follow.
-        """
+        """Train on the rollout unless AdaBoot withholds it; return scalars for the log."""
         self.adaboot.renew()
-        torch.mul(iteration.actor_rate, self.config.relative_step, out=self.trainer.rate)
         trained = self.adaboot.update_allowed()
         scalars = {
             "AdaBoot/trust": self.adaboot.probability.item(),
             "AdaBoot/trained": float(trained),
         }
         if trained:
-            scalars |= self._train(rollout, iteration.mini_batches)
+            scalars |= self._train(rollout, iteration)
         return scalars
 
-    def _train(self, rollout: GroupRolloutStorage, num_mini_batches: int) -> dict[str, float]:
+    def _train(self, rollout: GroupRolloutStorage, iteration: Iteration) -> dict[str, float]:
         obs = rollout.observations
-        rollout.shuffle_into(
-            self._data,
-            frames=self.estimator.frames(obs),
+        means = self.train(
+            rollout,
+            iteration,
             velocity=obs[names.VELOCITY],
             target=obs[names.NEXT_PROPRIO],
             skill=obs[names.SKILL],
             goes_on=rollout.dones == 0,
         )
-        self._num_mini_batches = num_mini_batches
-        means = self.trainer.train(self.config.epochs).tolist()
         tags = ("velocity", "prediction", "kl", "prior")
         return {f"Estimator/{tag}": value for tag, value in zip(tags, means, strict=True)}
 
@@ -171,30 +238,13 @@ class Estimation(Part):
             losses.gaussian_kl(prior_mean, prior_log_var, zero, zero).mean(),
         )
 
-    def networks(self) -> dict[str, nn.Module]:
-        """Return the estimator."""
-        return {"estimator": self.estimator}
-
-    def lasting(self) -> dict[str, nn.Module]:
-        """Return the estimator."""
-        return self.networks()
-
-    def onboard(self) -> Estimator:
-        """Return the estimator."""
-        return self.estimator
-
     def state_dict(self) -> dict:
         """Return network, optimizer and AdaBoot."""
-        return {
-            "estimator": self.estimator.state_dict(),
-            "optimizer": self.trainer.state_dict(),
-            "adaboot": self.adaboot.state_dict(),
-        }
+        return super().state_dict() | {"adaboot": self.adaboot.state_dict()}
 
     def load_state_dict(self, state: dict) -> None:
         """Go on from a saved state."""
-        self.estimator.load_state_dict(state["estimator"])
-        self.trainer.load_state_dict(state["optimizer"])
+        super().load_state_dict(state)
         self.adaboot.load_state_dict(state["adaboot"])
 
     def world_state(self) -> dict:

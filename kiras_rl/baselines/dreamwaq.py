@@ -22,7 +22,7 @@ from kiras_rl import interfaces as names
 from kiras_rl.algorithms.estimation import Estimation
 from kiras_rl.algorithms.part import Setting
 from kiras_rl.limits import LARGEST, limited
-from kiras_rl.models.estimator import VELOCITY_DIM, Estimator, mlp
+from kiras_rl.models.estimator import VELOCITY_DIM, VariationalEstimator, mlp
 from kiras_rl.schema import EstimatorConfig
 
 
@@ -47,7 +47,7 @@ class CENetConfig:
     kl_weight: float = field(metadata=limited(0, LARGEST))
 
 
-class CENet(Estimator):
+class CENet(VariationalEstimator):
     """Encoder E(o_{t-H..t}) -> velocity, z; decoder (velocity, z) -> o_{t+1}; prior N(0, I)."""
 
     def __init__(

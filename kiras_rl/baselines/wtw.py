@@ -15,28 +15,24 @@ Letters: N worlds, B rows, F feet, H past frames, P numbers a frame, K propertie
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
 import torch
-from tensordict import TensorDict
-from torch import nn
 
 from kiras_rl import interfaces as names
-from kiras_rl.algorithms.part import Iteration, Part, Setting
-from kiras_rl.algorithms.storage import GroupRolloutStorage, mini_batches
-from kiras_rl.algorithms.trainer import Trainer
+from kiras_rl.algorithms.estimation import VELOCITY_SCALE, Told
+from kiras_rl.algorithms.part import Iteration, Setting
+from kiras_rl.algorithms.storage import GroupRolloutStorage
 from kiras_rl.config import ConfigError
 from kiras_rl.deploy.gaits import TROT, trot_behaviour, trot_clock
 from kiras_rl.deploy.terms import observed
 from kiras_rl.interfaces import SkillEnv
 from kiras_rl.limits import LARGEST, limited
 from kiras_rl.models.estimator import VELOCITY_DIM, Estimator, mlp
-from kiras_rl.shards import Batch
 
 KAPPA = 0.07  # of a turn, by which the schedule is smoothed
-VELOCITY_SCALE = 2.0  # in the loss, as of KiRAS' estimator: errors in units of 0.5 m/s
 
 # --- the gait: Step and View are kiras_rl.envs' own -----------------------------------------------
 
@@ -143,54 +139,37 @@ class AdaptationModule(Estimator):
     ) -> None:
         """Build the network."""
         past = history_length * proprio_dim
-        super().__init__(past + proprio_dim, properties + past, [])  # its encoder is replaced
+        super().__init__(VELOCITY_DIM + properties + past)
         self._shape = {
             "proprio_dim": proprio_dim,
             "history_length": history_length,
             "properties": properties,
             "encoder_dims": list(encoder_dims),
         }
-        self._past, self._sizes = past, [VELOCITY_DIM, properties]
-        self.encoder = mlp(past + proprio_dim, encoder_dims, sum(self._sizes))
+        self._past = past
+        self.encoder = mlp(past + proprio_dim, encoder_dims, VELOCITY_DIM + properties)
 
     def frames(self, obs: Mapping[str, torch.Tensor]) -> torch.Tensor:
         """Return the past frames and the current one, oldest first, (N, (H + 1) * P)."""
         return torch.cat([obs[names.HISTORY], obs[names.PROPRIO]], dim=-1)
 
-    def forward(self, frames: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Say what frames (N, (H + 1) * P) tell.
-
-        Returns:
-            velocity: Base velocity in the base frame, (N, 3), m/s.
-            mean: Properties, in the scale of their observation, and past frames, (N, K + H * P).
-            log_var: Zero, as nothing is drawn, (N, K + H * P).
-        """
-        velocity, properties = self.encoder(frames).split(self._sizes, dim=-1)
-        mean = torch.cat([properties, frames[..., : self._past]], dim=-1)
-        return velocity, mean, torch.zeros_like(mean)
+    def context(self, frames: torch.Tensor) -> torch.Tensor:
+        """Return velocity, properties and past frames, (N, 3 + K + H * P)."""
+        return torch.cat([self.encoder(frames), frames[..., : self._past]], dim=-1)
 
 
-class Adaptation(Part):
+class Adaptation(Told):
     """The adaptation module and its trainer."""
 
     settings = WtwConfig
+    estimator: AdaptationModule
 
     def __init__(
         self, config: WtwConfig, module: AdaptationModule, columns: list[int], device: str
     ) -> None:
         """Take the network, and the columns of the critic's observation that it estimates."""
-        self.config, self.module = config, module.to(device)
+        super().__init__(module, config.relative_step, config.epochs, device)
         self._columns = torch.tensor(columns, device=device)
-        self._data: dict[str, torch.Tensor] = {}
-        self._num_mini_batches = 1
-        self.trainer = Trainer(
-            self.module.parameters(),
-            self._loss,
-            0.0,  # set anew before every update
-            device,
-            self._batches,
-            variant=lambda: self._num_mini_batches,
-        )
 
     @classmethod
     def build(cls, config: WtwConfig, setting: Setting) -> Adaptation:
@@ -206,35 +185,12 @@ class Adaptation(Part):
         module = AdaptationModule(proprio, history // proprio, len(columns), config.encoder_dims)
         return cls(config, module, columns, setting.device)
 
-    def groups(self, obs: TensorDict) -> dict[str, torch.Tensor]:
-        """Return the context."""
-        return {names.CONTEXT: self.context(obs)}
-
-    def observe(self, obs: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
-        """Return the context: the actor is trained with what the robot will be told."""
-        return {names.CONTEXT: self.context(obs)}
-
-    @torch.no_grad()
-    def context(self, obs: Mapping[str, torch.Tensor]) -> torch.Tensor:
-        """Return velocity, properties and past frames, (N, 3 + K + H * P)."""
-        return self.module.context(self.module.frames(obs))
-
     def update(self, rollout: GroupRolloutStorage, iteration: Iteration) -> dict[str, float]:
         """Train on the rollout; return the errors for the log."""
-        torch.mul(iteration.actor_rate, self.config.relative_step, out=self.trainer.rate)
         obs = rollout.observations
-        rollout.shuffle_into(
-            self._data,
-            frames=self.module.frames(obs),
-            velocity=obs[names.VELOCITY],
-            properties=obs[names.CRITIC][..., self._columns],
-        )
-        self._num_mini_batches = iteration.mini_batches
-        velocity, properties = self.trainer.train(self.config.epochs).tolist()
-        return {"Adaptation/velocity": velocity, "Adaptation/properties": properties}
-
-    def _batches(self) -> Iterator[Batch]:
-        return iter(mini_batches(self._data, self._num_mini_batches))
+        properties = obs[names.CRITIC][..., self._columns]
+        means = self.train(rollout, iteration, velocity=obs[names.VELOCITY], properties=properties)
+        return {"Adaptation/velocity": means[0], "Adaptation/properties": means[1]}
 
     def _loss(
         self, frames: torch.Tensor, velocity: torch.Tensor, properties: torch.Tensor
@@ -246,31 +202,10 @@ class Adaptation(Part):
             velocity: Base velocity in the base frame, (B, 3), m/s.
             properties: In the scale of their observation, (B, K).
         """
-        told, mean, _ = self.module(frames)
-        error = (told - velocity).square().mean()
-        other = (mean[:, : properties.shape[1]] - properties).square().mean()
+        told = self.estimator.encoder(frames)
+        error = (told[:, :VELOCITY_DIM] - velocity).square().mean()
+        other = (told[:, VELOCITY_DIM:] - properties).square().mean()
         return VELOCITY_SCALE**2 * error + other, torch.stack([error, other])
-
-    def networks(self) -> dict[str, nn.Module]:
-        """Return the adaptation module."""
-        return {"adaptation": self.module}
-
-    def lasting(self) -> dict[str, nn.Module]:
-        """Return the adaptation module."""
-        return self.networks()
-
-    def onboard(self) -> Estimator:
-        """Return the adaptation module."""
-        return self.module
-
-    def state_dict(self) -> dict:
-        """Return network and optimizer."""
-        return {"module": self.module.state_dict(), "optimizer": self.trainer.state_dict()}
-
-    def load_state_dict(self, state: dict) -> None:
-        """Go on from a saved state."""
-        self.module.load_state_dict(state["module"])
-        self.trainer.load_state_dict(state["optimizer"])
 
 
 def find_columns(env: SkillEnv, properties: list[str], proprio: int, critic: int) -> list[int]:

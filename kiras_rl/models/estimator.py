@@ -18,26 +18,17 @@ _LOG_VAR_RANGE = (-8.0, 4.0)
 
 
 class Estimator(nn.Module):
-    """A variational auto-encoder of frames whose encoder the robot takes along.
+    """What the robot takes along: frames -> context, whose first three numbers are a velocity.
 
-    Encoder E(frames) -> velocity, q(z | frames). A subclass has the decoder, and keeps the
-    arguments of its constructor in `_shape`.
+    A subclass says what `context` is, and keeps the arguments of its constructor in `_shape`.
     """
 
     _shape: dict
 
-    def __init__(self, frames_dim: int, latent_dim: int, encoder_dims: list[int]) -> None:
-        """Build the encoder.
-
-        Args:
-            frames_dim: F.
-            latent_dim: Z.
-            encoder_dims: Widths.
-        """
+    def __init__(self, context_dim: int) -> None:
+        """Remember the length of the context."""
         super().__init__()
-        self.latent_dim = latent_dim
-        self.context_dim = VELOCITY_DIM + latent_dim
-        self.encoder = mlp(frames_dim, encoder_dims, VELOCITY_DIM + 2 * latent_dim)
+        self.context_dim = context_dim
 
     def shape(self) -> dict:
         """Return the name of the class and the constructor's arguments, as plain values."""
@@ -47,6 +38,32 @@ class Estimator(nn.Module):
     def frames(self, obs: Mapping[str, torch.Tensor]) -> torch.Tensor:
         """Return what the encoder reads of `proprio` and `history`, (N, F): the past frames."""
         return obs[names.HISTORY]
+
+    def context(self, frames: torch.Tensor) -> torch.Tensor:
+        """Return what the actor sees, (N, context_dim), for frames (N, F).
+
+        It begins with the base velocity in the base frame, m/s.
+        """
+        raise NotImplementedError
+
+
+class VariationalEstimator(Estimator):
+    """A variational auto-encoder: encoder E(frames) -> velocity, q(z | frames).
+
+    A subclass has the decoder.
+    """
+
+    def __init__(self, frames_dim: int, latent_dim: int, encoder_dims: list[int]) -> None:
+        """Build the encoder.
+
+        Args:
+            frames_dim: F.
+            latent_dim: Z.
+            encoder_dims: Widths.
+        """
+        super().__init__(VELOCITY_DIM + latent_dim)
+        self.latent_dim = latent_dim
+        self.encoder = mlp(frames_dim, encoder_dims, VELOCITY_DIM + 2 * latent_dim)
 
     def forward(self, frames: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """Encode frames (N, F).
@@ -83,7 +100,7 @@ class Estimator(nn.Module):
         return zero, zero
 
 
-class ContextEstimator(Estimator):
+class ContextEstimator(VariationalEstimator):
     """The environment context estimator (ECE): a skill-conditioned CVAE on the history.
 
     Encoder E(o_{t-H..t-1}) -> velocity, z; decoder (z, skill) -> o_{t+1}; prior p(z | skill).

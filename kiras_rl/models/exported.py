@@ -10,7 +10,7 @@ from torch import nn
 
 from kiras_rl import interfaces as names
 from kiras_rl.classes import find_class
-from kiras_rl.models.estimator import ContextEstimator, Estimator
+from kiras_rl.models.estimator import VELOCITY_DIM, ContextEstimator, Estimator
 
 
 class ExportedPolicy(nn.Module):
@@ -20,10 +20,10 @@ class ExportedPolicy(nn.Module):
     was trained with is computed inside, so that the exported file needs nothing but these two.
 
     Args:
-        estimator: Frames that it chooses -> velocity (N, 3) m/s, mean (N, Z), log variance (N, Z);
-            None for an actor that reads the history itself.
-        actor_mlp: Network on [proprio, velocity, mean], or on [proprio, history] without an
-            estimator, to actions (N, J).
+        estimator: Frames that it chooses -> context; None for an actor that reads the history
+            itself.
+        actor_mlp: Network on [proprio, context], or on [proprio, history] without an estimator, to
+            actions (N, J).
     """
 
     def __init__(self, estimator: Estimator | None, actor_mlp: nn.Module) -> None:
@@ -49,8 +49,8 @@ class ExportedPolicy(nn.Module):
             velocity = proprio.new_zeros(proprio.shape[0], 3)
             return self.actor(torch.cat([proprio, history], dim=-1)), velocity
         frames = self.estimator.frames({names.PROPRIO: proprio, names.HISTORY: history})
-        velocity, mean, _ = self.estimator(frames)
-        return self.actor(torch.cat([proprio, velocity, mean], dim=-1)), velocity
+        context = self.estimator.context(frames)
+        return self.actor(torch.cat([proprio, context], dim=-1)), context[..., :VELOCITY_DIM]
 
     def shape(self) -> dict:
         """Return the sizes from which `build_policy` makes the same networks, without weights."""

@@ -35,6 +35,7 @@ def step_of(phase, **robot):
     )
     return SimpleNamespace(
         stands=torch.tensor([False, True]),
+        moves=torch.tensor([True, False]),
         weight=20.0,
         task=SimpleNamespace(terms=terms, skill=torch.tensor([0, 1])),
         keyframes=keyframes,
