@@ -10,13 +10,11 @@ from typing import Any
 
 import torch
 
-from kiras_rl.envs.lookup import find_terms
+from kiras_rl.envs.lookup import TermSet
 from kiras_rl.envs.memory import remembering
 from kiras_rl.envs.rewards import air_time
 from kiras_rl.envs.shapes import evaluate
 from kiras_rl.envs.state import Step
-
-_WHERE = "env.constraints"
 
 
 def joint_torque(step: Step, share: float) -> torch.Tensor:
@@ -70,13 +68,8 @@ def standing_feet(step: Step, feet: float) -> torch.Tensor:
     return (step.robot.foot_stands.float().sum(dim=-1) - feet).abs() * step.moves
 
 
-class Constraints:
-    """The configured constraints.
-
-    Attributes:
-        names: In the order of the YAML.
-        functions: Theirs, without parameters.
-    """
+class Constraints(TermSet):
+    """The configured constraints."""
 
     def __init__(self, terms: dict[str, Any]) -> None:
         """Look the constraints up.
@@ -84,9 +77,7 @@ class Constraints:
         Raises:
             ConfigError: Unknown constraint or parameter, or a parameter that is no number.
         """
-        self._terms = find_terms(globals(), terms, Step, _WHERE)
-        self.names = tuple(self._terms)
-        self.functions = [term.func for term in self._terms.values()]
+        super().__init__(globals(), terms, Step, "env.constraints")
 
     def __call__(self, step: Step) -> torch.Tensor:
         """Return how far each constraint is violated, (N, number of constraints), at least 0.
@@ -96,6 +87,7 @@ class Constraints:
         """
         shape = (len(step.fallen),)
         values = [
-            evaluate(term, step, f"{_WHERE}.{name}", shape) for name, term in self._terms.items()
+            evaluate(term, step, f"{self._where}.{name}", shape)
+            for name, term in self.terms.items()
         ]
         return torch.stack(values, dim=1).clamp(min=0.0)

@@ -69,6 +69,27 @@ def find_terms(
     }
 
 
+class TermSet:
+    """The configured terms of a kind.
+
+    Attributes:
+        names: In the order of the YAML.
+        functions: Theirs, without parameters.
+    """
+
+    def __init__(
+        self, module: Mapping[str, object], entries: Mapping[str, Any], first: type, where: str
+    ) -> None:
+        """Look the terms up; see `find_term`.
+
+        Raises:
+            ConfigError: Unknown term or parameter, or a parameter that is no number.
+        """
+        self.terms, self._where = find_terms(module, entries, first, where), where
+        self.names = tuple(self.terms)
+        self.functions = [term.func for term in self.terms.values()]
+
+
 def find_function(module: Mapping[str, object], name: str, first: type, where: str) -> Callable:
     """Return the public function `name` of a module whose first argument is of type `first`.
 

@@ -10,11 +10,9 @@ from typing import Any
 
 import torch
 
-from kiras_rl.envs.lookup import find_terms
+from kiras_rl.envs.lookup import TermSet
 from kiras_rl.envs.shapes import evaluate_mask
 from kiras_rl.envs.state import Step
-
-_WHERE = "env.terminations.terms"
 
 
 def base_contact(step: Step, force: float) -> torch.Tensor:
@@ -30,13 +28,8 @@ def tilted(step: Step, angle: float) -> torch.Tensor:
     return torch.maximum(target, start) < math.cos(math.radians(angle))
 
 
-class Terminations:
-    """The configured reasons for an episode to end by failure.
-
-    Attributes:
-        names: Of the reasons, in the order of the YAML.
-        functions: Theirs, without parameters.
-    """
+class Terminations(TermSet):
+    """The configured reasons for an episode to end by failure."""
 
     def __init__(self, terms: dict[str, Any]) -> None:
         """Look the reasons up.
@@ -44,9 +37,7 @@ class Terminations:
         Raises:
             ConfigError: Unknown reason or parameter, or a parameter that is no number.
         """
-        self._terms = find_terms(globals(), terms, Step, _WHERE)
-        self.names = list(self._terms)
-        self.functions = [term.func for term in self._terms.values()]
+        super().__init__(globals(), terms, Step, "env.terminations.terms")
 
     def __call__(self, step: Step) -> list[torch.Tensor]:
         """Return the worlds that end by each of the reasons, (N,) bool each.
@@ -56,6 +47,6 @@ class Terminations:
         """
         worlds = len(step.fallen)
         return [
-            evaluate_mask(term, step, f"{_WHERE}.{name}", worlds)
-            for name, term in self._terms.items()
+            evaluate_mask(term, step, f"{self._where}.{name}", worlds)
+            for name, term in self.terms.items()
         ]
